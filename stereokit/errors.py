@@ -1,0 +1,50 @@
+"""The errors that stereokit raises: one family under ``ValueError``.
+
+Every message is one line that names the argument, the value received and the rule, so that the command line
+can print it as it is.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = ["FileError", "InputError", "OptionError", "StereokitError", "UnknownNameError", "did_you_mean"]
+
+
+class StereokitError(ValueError):
+    """Base of every error that stereokit raises on purpose."""
+
+
+class InputError(StereokitError):
+    """An image, volume or map has a shape, type or content that cannot be used."""
+
+
+class OptionError(StereokitError):
+    """An option has a value outside its rule, or does not exist."""
+
+
+class UnknownNameError(OptionError):
+    """A method, stage, refiner or data set has no such name."""
+
+
+class FileError(StereokitError):
+    """A file is missing, cannot be read as what it should be, or cannot be written."""
+
+
+def did_you_mean(kind: str, name: str, known: Iterable[str]) -> str:
+    """Return the line that says that no `kind` is called `name`, with the nearest known name.
+
+    Parameters
+    ----------
+    kind : str
+        What was looked for, such as ``"cost"``.
+    name : str
+        The name that was asked for.
+    known : iterable of str
+        The names that exist.
+    """
+    names = sorted(known)
+    close = difflib.get_close_matches(name.lower(), names, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else "."
+    return f"no {kind} named {name!r}{hint} Known: {', '.join(names) or 'none'}"

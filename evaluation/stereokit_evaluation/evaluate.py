@@ -1,0 +1,290 @@
+"""The command ``stereokit evaluate``: methods, or finished maps, scored on a data set in one table.
+
+Scores are those of the KITTI 2015 development kit (`stereokit_evaluation.metrics`), pooled over images. A
+column counts only the images that have its ground truth. For scripts there is `run`.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit.io import write_bytes, write_image
+from stereokit_evaluation.datasets import load, select
+from stereokit_evaluation.errormap import error_map
+from stereokit_evaluation.frames import Frame
+from stereokit_evaluation.metrics import THRESHOLDS, Regions, Tally
+from stereokit_evaluation.runner import (
+    Estimate,
+    Estimator,
+    Result,
+    Scored,
+    Skipped,
+    from_files,
+    run,
+    score_frames,
+    with_matcher,
+)
+
+__all__ = ["Result", "evaluate", "run"]
+
+_DEFAULT_METHOD = "zncc+sgm"
+_DEFAULT_DISPARITIES = 128
+_BAR_AFTER_S = 1.0
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One row of the table: what is scored, and the words that describe it."""
+
+    estimate: Estimator
+    method: str
+    scale: float | None = None
+    refiner: str | None = None
+    device: str | None = None
+
+
+def evaluate(
+    dataset: Annotated[str, typer.Option(help="kitti2015, kitti2012, middlebury, eth3d, folder or scenes.")],
+    root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
+    frames: Annotated[str | None, typer.Option(help="Numbers or names, such as 0-3,34-40.")] = None,
+    method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,
+    scale: Annotated[float, typer.Option(help="1, or 0.5 to match at half size.")] = 1.0,
+    refiner: Annotated[str | None, typer.Option(help="Refiner for the half-size map.")] = None,
+    predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")
+    ] = None,
+    max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    color: Annotated[bool, typer.Option("--color/--gray", help="Images as stored, or grey.")] = False,
+    count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
+    error_maps: Annotated[Path | None, typer.Option(help="Write error maps to METHOD/NAME.png here.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+) -> None:
+    """Score matching methods, or finished disparity maps, against ground truth as KITTI 2015 does."""
+    try:
+        if json_file is not None and (json_file.is_dir() or not json_file.absolute().parent.is_dir()):
+            raise FileError(f"json must name a file in an existing folder, got {str(json_file)!r}")
+        chosen = select(load(dataset, root, count=count), frames)
+        if predictions is not None:
+            given = {"method": method, "refiner": refiner, "set": set_, "threads": threads}
+            for name in (name for name, value in given.items() if value):
+                raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")
+            runs = [_Run(from_files(predictions), "predictions")]
+            options: dict[str, Any] = {"predictions": str(predictions)}
+        else:
+            suggested = [frame.max_disparity for frame in chosen if frame.max_disparity is not None]
+            options = {
+                "max_disparity": max_disparity or max(suggested, default=_DEFAULT_DISPARITIES),
+                "threads": threads,
+                **_parse(set_ or ()),
+            }
+            names = method or [_DEFAULT_METHOD]
+            runs = [_matcher_run(name, scale, refiner, device, options, color) for name in names]
+        results, interrupted = _execute(runs, chosen, error_maps)
+        _print_table(f"{dataset}, {len(chosen)} frames", runs, results)
+        skipped = list(dict.fromkeys(skip for result in results for skip in result.skipped))
+        if json_file is not None:
+            document = {
+                "results": [_as_json(job, result) for job, result in zip(runs, results, strict=False)],
+                "dataset": dataset,
+                "options": {**options, "color": color, "frames": frames},
+                "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in skipped],
+                "interrupted": interrupted,
+                "version": _version(),
+            }
+            write_bytes(json_file, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    except StereokitError as error:
+        typer.echo(f"Error: {error}", err=True)
+        raise typer.Exit(2) from error
+    if interrupted:
+        raise typer.Exit(130)
+    if skipped:
+        raise typer.Exit(1)
+
+
+def _parse(pairs: Sequence[str]) -> dict[str, Any]:
+    """Read ``key=value`` options; values are Python numbers, true, false and none, or else words."""
+    words = {"true": True, "false": False, "none": None}
+    options: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        key = key.strip().replace("-", "_")
+        if not equals or not key.isidentifier():
+            raise OptionError(f"set must be key=value, got {pair!r}")
+        value = text.strip()
+        try:
+            options[key] = words[value.lower()] if value.lower() in words else ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            options[key] = value
+    return options
+
+
+def _matcher_run(
+    method: str, scale: float, refiner: str | None, device: str, options: dict[str, Any], color: bool
+) -> _Run:
+    from stereokit import Matcher
+
+    taken = {"method", "scale", "refiner", "device"} & options.keys()
+    if taken:
+        raise OptionError(f"set must not hold what has an option of its own, got {sorted(taken)[0]!r}")
+    matcher = Matcher(method, scale=scale, refiner=refiner, device=device, **options)
+    estimate = with_matcher(matcher, gray=not color)
+    return _Run(estimate, str(matcher.method), scale, refiner, str(matcher.device))
+
+
+def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -> tuple[list[Result], bool]:
+    """Run all, printing skipped frames as they come; an interrupt ends the work and keeps what was done."""
+    results: list[Result] = []
+    told: set[Skipped] = set()
+    with _progress(len(runs) * len(frames)) as (console, step):
+        for job in runs:
+            scored: list[Scored] = []
+            skipped: list[Skipped] = []
+            draw = None if maps is None else _draws(maps / job.method)
+            try:
+                for outcome in score_frames(frames, job.estimate, draw):
+                    if isinstance(outcome, Scored):
+                        scored.append(outcome)
+                    else:
+                        skipped.append(outcome)
+                        if outcome not in told:
+                            line = f"skipped {outcome.name}: {outcome.reason}"
+                            console.print(line, markup=False, highlight=False, soft_wrap=True)
+                            told.add(outcome)
+                    step(f"{job.method} {outcome.name}")
+            except KeyboardInterrupt:
+                console.print("interrupted; figures cover the frames that were done", highlight=False)
+                return [*results, Result(tuple(scored), tuple(skipped))], True
+            results.append(Result(tuple(scored), tuple(skipped)))
+    return results, False
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[tuple[Console, Callable[[str], None]]]:
+    """Show a bar on the terminal's error stream once the work has taken over a second."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    task = bar.add_task("", total=total)
+    begun = time.monotonic()
+
+    def step(text: str) -> None:
+        bar.update(task, advance=1, description=text)
+        if time.monotonic() - begun > _BAR_AFTER_S and not bar.live.is_started:
+            bar.start()
+
+    try:
+        yield console, step
+    finally:
+        bar.stop()
+
+
+def _draws(folder: Path) -> Callable[..., None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"error_maps must be a folder, got {str(folder)!r} ({error})") from error
+
+    def draw(frame: Frame, found: Estimate, noc: NDArray[Any] | None, occ: NDArray[Any] | None) -> None:
+        everything = noc if occ is None else occ
+        if everything is None:
+            return
+        name = frame.name.replace("/", "_")
+        write_image(folder / f"{name}.png", error_map(found.disparity, everything, noc))
+
+    return draw
+
+
+def _print_table(title: str, runs: Sequence[_Run], results: Sequence[Result]) -> None:
+    table = Table(title=title)
+    table.add_column("method", no_wrap=True)
+    heads = ("images", "D1 noc", "bg", "fg", "D1 occ", "bad-2", "EPE", "density", "ms/image")
+    for head in heads:
+        table.add_column(head, justify="right")
+    for job, result in zip(runs, results, strict=False):
+        noc, occ, main = result.score.noc, result.score.occ, result.score.main
+        seconds = result.seconds_per_image
+        figures = (
+            *(part.filled.d1() for part in (noc.all, noc.bg, noc.fg, occ.all)),
+            main.filled.bad_x(2.0),
+            main.filled.epe(),
+        )
+        table.add_row(
+            " ".join(str(word) for word in (job.method, job.refiner, _half(job.scale)) if word),
+            str(len(result.frames)),
+            *("-" if figure is None else f"{figure:.2f}" for figure in figures),
+            "-" if (density := main.density()) is None else f"{density:.1f}",
+            "-" if seconds is None else f"{1000 * seconds:.1f}",
+        )
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+def _half(scale: float | None) -> str:
+    return "" if scale in (None, 1.0) else f"x{scale:g}"
+
+
+def _as_json(job: _Run, result: Result) -> dict[str, Any]:
+    """Return one entry of ``results``: percent and pixels, pooled; None where ground truth is missing."""
+    pooled = result.score
+    return {
+        "method": job.method,
+        "scale": job.scale,
+        "refiner": job.refiner,
+        "device": job.device,
+        "images": len(result.frames),
+        "d1": {"noc": _d1(pooled.noc), "occ": _d1(pooled.occ)},
+        "epe": pooled.main.filled.epe(),
+        "density": pooled.main.density(),
+        "seconds_per_image": result.seconds_per_image,
+        "bad": {"noc": _bad(pooled.noc.all.filled), "occ": _bad(pooled.occ.all.filled)},
+        "est": {
+            "d1": {"noc": _d1(pooled.noc, est=True), "occ": _d1(pooled.occ, est=True)},
+            "bad": {"noc": _bad(pooled.noc.all.measured), "occ": _bad(pooled.occ.all.measured)},
+            "epe": pooled.main.measured.epe(),
+        },
+        "pixels": {"noc": pooled.noc.all.filled.pixels, "occ": pooled.occ.all.filled.pixels},
+        "frames": [
+            {
+                "name": frame.name,
+                "d1": {"noc": frame.score.noc.all.filled.d1(), "occ": frame.score.occ.all.filled.d1()},
+                "epe": frame.score.main.filled.epe(),
+                "seconds": frame.seconds,
+            }
+            for frame in result.frames
+        ],
+        "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in result.skipped],
+    }
+
+
+def _d1(regions: Regions, *, est: bool = False) -> dict[str, float | None]:
+    parts = {"all": regions.all, "bg": regions.bg, "fg": regions.fg}
+    return {name: (part.measured if est else part.filled).d1() for name, part in parts.items()}
+
+
+def _bad(tally: Tally) -> dict[str, float | None]:
+    return {f"{x:g}": tally.bad_x(x) for x in THRESHOLDS}
+
+
+def _version() -> str | None:
+    try:
+        return version("stereokit")
+    except PackageNotFoundError:
+        return None

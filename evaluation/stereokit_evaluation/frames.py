@@ -1,0 +1,110 @@
+"""One stereo pair with its ground truth, loaded when asked, and the choice of pairs by name or number."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import OptionError
+from stereokit.io import read_image
+
+__all__ = ["Frame", "Loader", "select"]
+
+Loader = Callable[[], NDArray[Any]]
+"""A function without arguments that returns an image or a map."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One stereo pair and what is known about it.
+
+    Parameters
+    ----------
+    name : str
+        Unique in its data set.
+    left, right : Path or callable
+        The images: a file, or a function that returns the array.
+    noc, occ, objects : callable, optional
+        Functions that return the true disparity of the pixels that both cameras see, of all pixels, and the
+        object map; None where there is none.
+    max_disparity : int, optional
+        Disparities to search for this pair, None if the data set does not say.
+    """
+
+    name: str
+    left: Path | Loader
+    right: Path | Loader
+    noc: Loader | None = None
+    occ: Loader | None = None
+    objects: Loader | None = None
+    max_disparity: int | None = None
+
+    def load_left(self, *, gray: bool = False) -> NDArray[Any]:
+        """Return the left image, (H, W) or (H, W, 3) RGB, in the type that it was stored in."""
+        return _image(self.left, gray)
+
+    def load_right(self, *, gray: bool = False) -> NDArray[Any]:
+        """Return the right image, as `load_left`."""
+        return _image(self.right, gray)
+
+    def load_noc(self) -> NDArray[np.float32] | None:
+        """Return the disparity of pixels that both cameras see, float32 (H, W), NaN unknown, or None."""
+        return None if self.noc is None else self.noc()
+
+    def load_occ(self) -> NDArray[np.float32] | None:
+        """Return the disparity of all pixels, float32 (H, W), NaN unknown, or None."""
+        return None if self.occ is None else self.occ()
+
+    def load_objects(self) -> NDArray[Any] | None:
+        """Return the object map, (H, W) integers, 0 background, or None."""
+        return None if self.objects is None else self.objects()
+
+
+def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:
+    """Return the frames that a list such as ``"0-3,34-40"`` or ``"cones,teddy"`` names, in their own order.
+
+    A part is the name of a frame (or the last part of it), or a number or range of numbers, both ends
+    included, compared with the number at the end of the name; the ``_10`` of KITTI does not count.
+
+    Raises
+    ------
+    OptionError
+        If a part is empty, a range runs backwards, or a part matches no frame.
+    """
+    everything = list(frames)
+    if which is None:
+        return everything
+    chosen: set[str] = set()
+    for part in (text.strip() for text in which.split(",")):
+        names = {f.name for f in everything if part and part in (f.name, f.name.rpartition("/")[2])}
+        if not names and (match := re.fullmatch(r"([0-9]+)(?:-([0-9]+))?", part)):
+            first, last = int(match[1]), int(match[2] or match[1])
+            if last < first:
+                raise OptionError(f"frames must be ranges with the smaller number first, got {part!r}")
+            names = {f.name for f in everything if (n := _number(f.name)) is not None and first <= n <= last}
+        if not names:
+            known = ", ".join(f.name for f in everything[:3])
+            raise OptionError(f"frames must be in the data set ({known} ...), got {part!r}")
+        chosen |= names
+    return [frame for frame in everything if frame.name in chosen]
+
+
+def _number(name: str) -> int | None:
+    match = re.search(r"([0-9]+)_1[01]$", name) or re.search(r"([0-9]+)$", name)
+    return int(match[1]) if match else None
+
+
+def _image(source: Path | Loader, gray: bool) -> NDArray[Any]:
+    if isinstance(source, Path):
+        return read_image(source, gray=gray)
+    image = source()
+    if gray and image.ndim == 3:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    return image

@@ -1,0 +1,1 @@
+"""Cost aggregation: each sweeps over the rows that a cost produces."""

@@ -1,0 +1,159 @@
+"""Semi-global matching (StereoVAE paper, equations 4-5; Hirschmueller 2008, equation 13).
+
+Costs are aggregated along 4, 5 or 8 straight paths through the image and summed. Two sweeps carry the paths that
+come from above and from below, a row at a time: each computes the costs of a row when it gets there, so that no
+cost volume is stored (`stereokit.aggregation._paths` has the picture).
+
+The down sweep visits the upper half first while the up sweep visits the lower half; each leaves the sum of its
+three paths. Then each goes on into the half where the other has been, adds what it finds there and the two paths
+along the row, and selects. The two never meet in a row, so two threads give what one thread gives, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.aggregation._paths import PathBuffers, first_visit, last_visit_row, start
+from stereokit.costs.rows import Levels
+from stereokit.errors import OptionError
+from stereokit.kernels.jit import kernel
+from stereokit.kernels.pool import run
+from stereokit.kernels.simd import LANES
+from stereokit.kernels.workspace import Workspace
+from stereokit.registry import AGGREGATIONS
+from stereokit.selection.wta import Winners, select_row
+
+__all__ = ["Sgm"]
+
+
+@AGGREGATIONS.register("sgm")
+@dataclass(frozen=True)
+class Sgm:
+    """Sum of the path costs along 4, 5 or 8 directions.
+
+    Parameters
+    ----------
+    p1 : float
+        Penalty for a step of one level, as a share of the cost's range.
+    p2 : float
+        Penalty for a larger step, as a share of the cost's range.
+    paths : {8, 5, 4}
+        Directions: all eight; the five that need only one sweep (all but those from below; one thread and next to
+        no memory); left, right, up and down.
+    """
+
+    p1: float = 0.19
+    p2: float = 2.5
+    paths: int = 8
+    name: ClassVar[str] = "sgm"
+    total_dtype: ClassVar[Any] = np.uint16
+
+    def __post_init__(self) -> None:
+        if self.paths not in (4, 5, 8):
+            raise OptionError(f"paths must be 4, 5 or 8, got {self.paths!r}")
+
+    def penalties(self, cost_max: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return P1 and P2 by grey difference between the two pixels of a step, each (256,)."""
+        p1 = int(round(self.p1 * cost_max))
+        p2 = int(round(self.p2 * cost_max))
+        if not 0 <= p1 <= p2:
+            raise OptionError(f"p1 must be from 0 to p2, got p1={self.p1} and p2={self.p2}")
+        if cost_max + p2 > 255:
+            most = (255 - cost_max) / cost_max
+            raise OptionError(f"p2 must be at most {most:.3g} for costs up to {cost_max}, got {self.p2}")
+        return np.full(256, p1, np.uint8), np.full(256, p2, np.uint8)
+
+    def sweep(
+        self, rows: list[Any], levels: Levels, cost_max: int, guide: NDArray[np.uint8], workspace: Workspace,
+        threads: int, out: Winners, total: NDArray[np.uint16] | None = None,
+    ) -> None:  # fmt: skip
+        """Aggregate the rows of two producers and select.
+
+        Parameters
+        ----------
+        rows : two row producers
+            One per sweep.
+        levels : Levels
+            Disparities.
+        cost_max : int
+            Largest cost.
+        guide : (H, W) uint8
+            The left image, which the penalties may follow.
+        workspace : Workspace
+            Buffers.
+        threads : int
+            1 or more; two are used.
+        out : Winners
+            Where selection goes.
+        total : (H, W, P) uint16 or None
+            Where the sums over all paths go, if they are wanted.
+        """
+        p1, p2 = self.penalties(cost_max)
+        height, width = guide.shape
+        size = width * levels.padded
+        diagonals = self.paths != 4
+        most = int(p2.max())
+        sums_dtype = np.uint8 if (3 if diagonals else 1) * most <= 255 else np.uint16
+        across_dtype = np.uint8 if 2 * most <= 255 else np.uint16
+        both = self.paths != 5
+        sums = workspace.array("sgm.sums", height * size if both else 1, sums_dtype)
+        keep = np.empty(0, np.uint16) if total is None else total.reshape(-1)
+        workers = []
+        for k in range(2 if both else 1):
+            buffers = PathBuffers(
+                tuple(range(levels.padded // LANES)),
+                diagonals,
+                self.paths,
+                width,
+                workspace.array(f"sgm.cost{k}", size, np.uint8),
+                workspace.array(f"sgm.across{k}", size, across_dtype),
+                workspace.array(f"sgm.chains{k}", 2 * levels.padded, np.uint8),
+                workspace.array(f"sgm.state{k}", 3 * size, np.uint8),
+                workspace.array(f"sgm.least{k}", 3 * width, np.uint8),
+                workspace.array(f"sgm.penalties{k}", 8 * width, np.uint8),
+                workspace.array(f"sgm.total{k}", size, np.uint16),
+            )
+            start(buffers)
+            workers.append(buffers)
+        if not both:
+            _last_visit(rows[0], workers[0], guide, p1, p2, 0, height, 1, 0, sums, False, out, keep)
+            return
+        middle = height // 2
+        a, b = workers
+        run(
+            [
+                lambda: first_visit(rows[0], a, guide, p1, p2, 0, middle, sums),
+                lambda: first_visit(rows[1], b, guide, p1, p2, height - 1, middle - 1, sums),
+            ],
+            threads,
+        )
+        run(
+            [
+                lambda: _last_visit(
+                    rows[0], a, guide, p1, p2, middle, height, 1, middle, sums, True, out, keep
+                ),
+                lambda: _last_visit(
+                    rows[1], b, guide, p1, p2, middle - 1, -1, -1, height - middle, sums, True, out, keep
+                ),
+            ],
+            threads,
+        )
+
+
+@kernel
+def _last_visit(
+    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], p1: NDArray[np.uint8], p2: NDArray[np.uint8],
+    y0: int, y1: int, step: int, k0: int, sums: NDArray[Any], stored: bool, out: Winners,
+    total: NDArray[np.uint16],
+) -> None:  # fmt: skip
+    padded = LANES * len(buffers.blocks)
+    size = buffers.width * padded
+    for y in range(y0, y1, step):
+        last_visit_row(rows, buffers, guide, p1, p2, y, step, k0 + (y - y0) * step, sums, stored)
+        if total.size > 0:
+            total[y * size : (y + 1) * size] = buffers.total
+        select_row(buffers.total, buffers.total, buffers.width, padded, y * buffers.width, out)

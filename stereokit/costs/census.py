@@ -1,0 +1,134 @@
+"""Census transform and Hamming distance (Zabih and Woodfill 1994).
+
+Bit ``k`` of a pixel's census tells whether neighbour ``k`` of its window is darker, ``I(q) < I(p)``; the cost of a
+match is the number of bits that differ. All neighbours of the window count (62 of 9x7). Borders are clamped.
+
+The bits are kept as byte planes, eight neighbours to a plane: then the Hamming distances of 64 levels are, plane
+by plane, one load, one exclusive or, one population count and one addition of bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.costs.rows import Pair, Cells, close_row, implements, pad_pair, cells_of
+from stereokit.errors import OptionError
+from stereokit.kernels.jit import kernel
+from stereokit.kernels.pool import run, spans
+from stereokit.kernels.simd import LANES, add, count_bits, either, less_bit, load, splat, store, xor
+from stereokit.kernels.workspace import Workspace
+from stereokit.registry import COSTS
+
+__all__ = ["Census"]
+
+_WINDOWS = {"5x5": (5, 5), "7x7": (7, 7), "9x7": (9, 7)}
+
+
+class CensusRows(NamedTuple):
+    """Byte planes of both images, for `cost_row`."""
+
+    cells: Cells
+    planes: tuple[int, ...]  # 0, 1, ..: its length is known to the compiler
+    left: NDArray[np.uint8]  # element (y * planes + p) * left_stride + x
+    left_stride: int
+    right: NDArray[np.uint8]  # reversed, element (y * planes + p) * right_stride + k
+    right_stride: int
+
+
+@COSTS.register("census")
+@dataclass(frozen=True)
+class Census:
+    """Hamming distance of census transforms, one unit per neighbour that differs.
+
+    Parameters
+    ----------
+    window : {"9x7", "7x7", "5x5"}
+        Width x height of the window; 62, 48 or 24 neighbours, which is also the largest cost.
+    """
+
+    window: str = "9x7"
+    name: ClassVar[str] = "census"
+
+    def __post_init__(self) -> None:
+        if self.window not in _WINDOWS:
+            raise OptionError(f"window of census must be one of {', '.join(_WINDOWS)}, got {self.window!r}")
+
+    @property
+    def cost_max(self) -> int:
+        """Largest cost."""
+        width, height = _WINDOWS[self.window]
+        return width * height - 1
+
+    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[CensusRows]:
+        """Transform both images; return the row producers of `workers` sweeps."""
+        height, width = pair.left.shape
+        across, down = (size // 2 for size in _WINDOWS[self.window])
+        margin = max(across, down)
+        offsets = [
+            (dy, dx)
+            for dy in range(-down, down + 1)
+            for dx in range(-across, across + 1)
+            if (dy, dx) != (0, 0)
+        ]
+        dy, dx = (np.array(part, np.int64) for part in zip(*offsets, strict=True))
+        planes = -(-len(offsets) // 8)
+        left, right = pad_pair(pair, margin, workspace)
+        left_stride = -(-width // LANES) * LANES
+        right_stride = width + pair.levels.padded + LANES
+        left_planes = workspace.array("census.left", height * planes * left_stride, np.uint8)
+        right_planes = workspace.array("census.right", height * planes * right_stride, np.uint8)
+        left_image = (left.ravel(), left.shape[1], margin, width)
+        right_image = (right.ravel(), right.shape[1], margin, width + pair.levels.padded)
+        tasks: list[Any] = []
+        for y0, y1 in spans(height, pair.threads):
+            tasks.append(
+                lambda y0=y0, y1=y1: _transform(*left_image, dy, dx, y0, y1, left_planes, left_stride)
+            )
+            tasks.append(
+                lambda y0=y0, y1=y1: _transform(*right_image, dy, -dx, y0, y1, right_planes, right_stride)
+            )
+        run(tasks, pair.threads)
+        cells = cells_of(pair, self.cost_max, workspace)
+        rows = CensusRows(cells, tuple(range(planes)), left_planes, left_stride, right_planes, right_stride)
+        return [rows] * workers
+
+
+@kernel
+def _transform(
+    image: NDArray[Any], image_stride: int, margin: int, width: int, dy: NDArray[np.int64],
+    dx: NDArray[np.int64], y0: int, y1: int, out: NDArray[np.uint8], out_stride: int,
+) -> None:  # fmt: skip
+    planes = (dy.size + 7) // 8
+    for y in range(y0, y1):
+        for x in range(0, width, LANES):
+            at = (y + margin) * image_stride + margin + x
+            centre = load(image, at)
+            for plane in range(planes):
+                bits = splat(np.uint8(0))
+                for k in range(8 * plane, min(8 * plane + 8, dy.size)):
+                    neighbour = load(image, at + dy[k] * image_stride + dx[k])
+                    bits = either(bits, less_bit(neighbour, centre, np.uint8(1 << (k - 8 * plane))))
+                store(out, (y * planes + plane) * out_stride + x, bits)
+
+
+@implements(CensusRows)
+@kernel
+def _census_row(rows: CensusRows, y: int, out: NDArray[np.uint8]) -> None:
+    cells = rows.cells
+    planes = len(rows.planes)
+    left = y * planes * rows.left_stride
+    right = y * planes * rows.right_stride
+    for x in range(cells.width):
+        k = cells.width - 1 - x
+        for block in range(0, cells.padded, LANES):
+            cost = splat(np.uint8(0))
+            for p in range(planes):
+                mine = splat(rows.left[left + p * rows.left_stride + x])
+                theirs = load(rows.right, right + p * rows.right_stride + k + block)
+                cost = add(cost, count_bits(xor(mine, theirs)))
+            store(out, x * cells.padded + block, cost)
+    close_row(cells, y, out)

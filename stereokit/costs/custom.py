@@ -1,0 +1,73 @@
+"""Costs that a user writes as one plain numba function.
+
+The costs of the whole image are computed once into a volume and then stream through the same sweeps as those of
+the built-in costs; nothing needs to be compiled again but the function itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stereokit.costs.rows import Pair, VolumeRows
+from stereokit.errors import OptionError
+from stereokit.kernels.pool import run, spans
+from stereokit.kernels.workspace import Workspace
+
+__all__ = ["RowCost"]
+
+
+@dataclass(frozen=True)
+class RowCost:
+    """A cost made of one compiled function.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(left, right, y, min_disparity, out)``, compiled with ``numba.njit(nogil=True)``. It writes the
+        costs of row `y` into `out`, ``(W, D)`` ``uint8`` from 0 (equal) to `cost_max`; ``out[x, d]`` compares left
+        column ``x`` with right column ``x - d - min_disparity``. Images are ``(H, W)`` ``uint8`` or ``uint16``.
+        Cells whose right pixel lies outside the image need not be written.
+    cost_max : int
+        Largest cost that it writes, 1 to 254.
+    """
+
+    function: Callable[..., None]
+    cost_max: int
+    name: str = "custom"
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise OptionError(f"function of a row cost must be callable, got {self.function!r}")
+        if not isinstance(self.cost_max, int) or not 1 <= self.cost_max <= 254:
+            raise OptionError(f"cost_max must be an integer from 1 to 254, got {self.cost_max!r}")
+
+    def __call__(self) -> RowCost:
+        """Return itself: a row cost has no options, so it is its own factory in the registry."""
+        return self
+
+    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[VolumeRows]:
+        """Compute the cost volume; return its rows for `workers` sweeps."""
+        height, width = pair.left.shape
+        levels = pair.levels
+        volume = workspace.array("custom.volume", (height, width, levels.count), np.uint8)
+        worst = np.uint8(self.cost_max if pair.outside is None else round(pair.outside * self.cost_max))
+        columns = np.arange(width)[:, None] - np.arange(levels.count)[None, :] - levels.minimum
+        outside = (columns < 0) | (columns >= width)
+
+        def fill(y0: int, y1: int) -> None:
+            for y in range(y0, y1):
+                row = volume[y]
+                self.function(pair.left, pair.right, y, levels.minimum, row)
+                np.copyto(row, worst, where=outside)
+                if pair.right_bad is not None:
+                    np.copyto(row, worst, where=pair.right_bad[y, np.clip(columns, 0, width - 1)])
+                if pair.left_bad is not None:
+                    row[pair.left_bad[y]] = worst
+
+        tasks: list[Any] = [lambda y0=y0, y1=y1: fill(y0, y1) for y0, y1 in spans(height, pair.threads)]
+        run(tasks, pair.threads)
+        return [VolumeRows(volume, levels.padded)] * workers

@@ -1,0 +1,229 @@
+"""What every cost shares: the levels of disparity, the padded images, and how a row of costs is closed.
+
+A cost is a *producer of rows*. It prepares an image pair once and returns, for each worker, a named tuple of
+arrays; `cost_row` then writes the costs of row `y`, ``(W, P)`` ``uint8``, disparity innermost, when a sweep asks
+for it. Costs are cheap to compute again, so the cost volume is never stored.
+
+Which code `cost_row` runs is decided by the *type* of the named tuple when a sweep is compiled (see
+`implements`): two producers times two sweeps are four specialisations of one source, and a third cost is one
+more file.
+
+The right image is stored reversed: level ``d`` of left column ``x`` needs right column ``x - d - min_disparity``,
+which is element ``(W - 1 - x) + d`` of the reversed row. So the levels of one pixel are contiguous on the right
+too, and one vector load brings 64 of them::
+
+    right column   W-1-min  ...   x-min   x-min-1   x-min-2 ...
+    element            0    ...   W-1-x   W-x       W-x+1   ...
+    level of x                      0       1         2     ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.pool import run, spans
+from stereokit.kernels.simd import LANES, either, load, maximum, minimum, splat, store
+from stereokit.kernels.workspace import Workspace
+
+__all__ = ["WORST", "Levels", "Pair", "Cells", "VolumeRows", "close_row", "cost_row", "implements", "pad_pair", "cells_of"]
+
+WORST = np.uint8(255)
+"""Cost of the levels that pad a row to a multiple of `LANES`; it saturates and can never win."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """The disparities that are tried: ``minimum <= d < minimum + count``, in pixels."""
+
+    minimum: int
+    count: int
+
+    @property
+    def padded(self) -> int:
+        """`count` rounded up to a multiple of `LANES`."""
+        return -(-self.count // LANES) * LANES
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A checked image pair, ready for a cost.
+
+    Attributes
+    ----------
+    left, right : (H, W) uint8 or uint16, C-contiguous
+        Grey images without gaps (invalid pixels are filled with a neighbour's value).
+    left_bad, right_bad : (H, W) bool or None
+        Pixels that were NaN or infinite and carry no evidence; None when there are none.
+    levels : Levels
+        Disparities to try.
+    outside : float or None
+        Cost of a level whose right pixel lies outside the image, as a share of the cost's range; None takes
+        the nearest border pixel instead.
+    threads : int
+        How many threads preparation may use.
+    """
+
+    left: NDArray[Any]
+    right: NDArray[Any]
+    left_bad: NDArray[np.bool_] | None
+    right_bad: NDArray[np.bool_] | None
+    levels: Levels
+    outside: float | None
+    threads: int = 1
+
+
+class Cells(NamedTuple):
+    """Which cells of a row of costs have no evidence (flat arrays, for kernels)."""
+
+    width: int
+    padded: int
+    minimum: int
+    outside: np.uint8  # cost of a cell without evidence
+    low: NDArray[np.uint8]  # per element of the reversed right row: bounds that the cost is held to,
+    high: NDArray[np.uint8]  # 0 and 255 where there is evidence, `outside` twice where there is none
+    stride: int  # from one row of low and high to the next; 0 when all rows share one
+    left_bad: NDArray[np.uint8]  # (H * W), or empty when every pixel is valid
+    padding: NDArray[np.uint8]  # (P): 0 for levels that exist, 255 for those that pad
+
+
+def cost_row(rows: Any, y: int, out: Any) -> None:
+    """Write the costs of image row `y` into the flat ``uint8`` array `out` (``W * P``); compiled code only."""
+    raise NotImplementedError("cost_row can be called from compiled code only")
+
+
+def implements(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that makes a compiled function the `cost_row` of the named tuple `kind`."""
+
+    def add(function: Callable[..., None]) -> Callable[..., None]:
+        def choose(rows: Any, y: Any, out: Any) -> Any:
+            if isinstance(rows, types.BaseNamedTuple) and rows.instance_class is kind:
+                return lambda rows, y, out: function(rows, y, out)
+            return None
+
+        overload(cost_row, strict=False)(choose)
+        return function
+
+    return add
+
+
+def cells_of(pair: Pair, cost_max: int, workspace: Workspace) -> Cells:
+    """Return the evidence of `pair` for a cost whose range is ``0..cost_max``."""
+    height, width = pair.left.shape
+    levels = pair.levels
+    outside = np.uint8(cost_max if pair.outside is None else round(pair.outside * cost_max))
+    stride = width + levels.padded
+    shared = pair.right_bad is None
+    low = workspace.array("cells.low", (1 if shared else height, stride), np.uint8)
+    high = workspace.array("cells.high", low.shape, np.uint8)
+    columns = width - 1 - levels.minimum - np.arange(stride)
+    inside = (columns >= 0) & (columns < width)
+    evidence = np.broadcast_to(inside | (pair.outside is None), low.shape)
+    if pair.right_bad is not None:
+        evidence = evidence & ~pair.right_bad[:, np.clip(columns, 0, width - 1)]
+    low[...] = np.where(evidence, 0, outside)
+    high[...] = np.where(evidence, 255, outside)
+    left_bad = np.empty(0, np.uint8) if pair.left_bad is None else pair.left_bad.view(np.uint8).ravel()
+    padding = workspace.array("cells.padding", levels.padded, np.uint8)
+    padding[: levels.count] = 0
+    padding[levels.count :] = WORST
+    return Cells(
+        width, levels.padded, levels.minimum, outside, low.ravel(), high.ravel(), 0 if shared else stride,
+        left_bad, padding,
+    )  # fmt: skip
+
+
+@inline
+def _hold(cells: Cells, y: int, x: int, out: NDArray[np.uint8]) -> None:
+    right = y * cells.stride + cells.width - 1 - x
+    for block in range(0, cells.padded, LANES):
+        cost = load(out, x * cells.padded + block)
+        cost = minimum(maximum(cost, load(cells.low, right + block)), load(cells.high, right + block))
+        store(out, x * cells.padded + block, cost)
+
+
+@kernel
+def close_row(cells: Cells, y: int, out: NDArray[np.uint8]) -> None:
+    """Give the cells of row `y` without evidence their cost, and the padding levels theirs."""
+    if cells.stride > 0:
+        for x in range(cells.width):
+            _hold(cells, y, x, out)
+    else:
+        for x in range(min(cells.width, max(0, cells.padded - 1 + cells.minimum))):
+            _hold(cells, y, x, out)
+        for x in range(max(0, cells.width + min(cells.minimum, 0)), cells.width):
+            _hold(cells, y, x, out)
+    if cells.left_bad.size > 0:
+        for x in range(cells.width):
+            if cells.left_bad[y * cells.width + x] != 0:
+                for block in range(0, cells.padded, LANES):
+                    store(out, x * cells.padded + block, splat(cells.outside))
+    if cells.padding[cells.padded - 1] != 0:
+        last = cells.padded - LANES
+        padding = load(cells.padding, last)
+        for x in range(cells.width):
+            store(out, x * cells.padded + last, either(load(out, x * cells.padded + last), padding))
+
+
+@kernel
+def _pad(image: NDArray[Any], y0: int, y1: int, margin: int, reversed_from: int, out: NDArray[Any]) -> None:
+    """Copy rows of `image` with clamped borders; reversed, from column `reversed_from`, unless that is < -10**9."""
+    height, width = image.shape
+    for row in range(y0, y1):
+        source = image[min(max(row - margin, 0), height - 1)]
+        target = out[row]
+        if reversed_from > -(10**9):
+            for k in range(target.size):
+                target[k] = source[min(max(reversed_from - k, 0), width - 1)]
+        else:
+            for k in range(target.size):
+                target[k] = source[min(max(k - margin, 0), width - 1)]
+
+
+def pad_pair(pair: Pair, margin: int, workspace: Workspace) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the left image with clamped borders, and the right one reversed with clamped borders.
+
+    Returns
+    -------
+    left : (H + 2 * margin, W' >= W + 2 * margin)
+        Element ``[y + margin, x + margin]`` is pixel ``(y, x)``.
+    right : (H + 2 * margin, W' >= W + P + 2 * margin)
+        Element ``[y + margin, k + margin]`` is right column ``W - 1 - min_disparity - k``.
+    """
+    height, width = pair.left.shape
+    rows = height + 2 * margin
+    left = workspace.array("pad.left", (rows, width + 2 * margin + LANES), pair.left.dtype)
+    right_width = width + pair.levels.padded + 2 * margin + LANES
+    right = workspace.array("pad.right", (rows, right_width), pair.left.dtype)
+    start = width - 1 - pair.levels.minimum + margin
+    tasks: list[Callable[[], object]] = []
+    for y0, y1 in spans(rows, pair.threads):
+        tasks.append(lambda y0=y0, y1=y1: _pad(pair.left, y0, y1, margin, -(10**9), left))  # type: ignore[misc]
+        tasks.append(lambda y0=y0, y1=y1: _pad(pair.right, y0, y1, margin, start, right))  # type: ignore[misc]
+    run(tasks, pair.threads)
+    return left, right
+
+
+class VolumeRows(NamedTuple):
+    """Rows of a cost volume that is already there: ``(H, W, D)`` ``uint8``, not padded."""
+
+    volume: NDArray[np.uint8]
+    padded: int
+
+
+@implements(VolumeRows)
+@kernel
+def _volume_row(rows: VolumeRows, y: int, out: NDArray[np.uint8]) -> None:
+    _, width, count = rows.volume.shape
+    for x in range(width):
+        for d in range(count):
+            out[x * rows.padded + d] = rows.volume[y, x, d]
+        for d in range(count, rows.padded):
+            out[x * rows.padded + d] = 255

@@ -1,0 +1,232 @@
+"""Zero-mean normalised cross-correlation (StereoVAE paper, equations 1-3).
+
+``rho = sum(dL * dR) / (sL * sR)`` over a square window with clamped borders, and ``C = min(1 - rho, 1)``. The
+printed range of C is [0, 1] while ``1 - rho`` reaches 2, so it is clipped; a window without variance on either
+side has C = 1.
+
+With n pixels in the window, ``rho = (n*sum(LR) - sum(L)*sum(R)) / (sqrt(vL) * sqrt(vR))`` where
+``v = n*sum(I*I) - sum(I)**2``. The numerator is computed exactly in 32-bit integers: it may wrap on the way, but
+its value is at most ``(n * range / 2)**2``, and images are brought into a range for which that fits. Sums slide:
+the column sums of the products take one row in and one out, the window takes one column in and one out, so the
+work per cell does not grow with the window. The cost is rounded to `steps` levels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.costs.rows import Pair, Cells, close_row, implements, pad_pair, cells_of
+from stereokit.errors import OptionError
+from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.pool import run, spans
+from stereokit.kernels.simd import LANES, add, convert, load, maximum, minimum, multiply, splat, store, subtract
+from stereokit.kernels.workspace import Workspace
+from stereokit.registry import COSTS
+
+__all__ = ["Zncc"]
+
+
+class ZnccRows(NamedTuple):
+    """Padded images, window statistics and the running sums of one worker, for `cost_row`."""
+
+    cells: Cells
+    half: int  # half the window
+    left: NDArray[Any]  # padded image, element (y + half) * left_stride + half + x
+    left_stride: int
+    right: NDArray[Any]  # padded and reversed, element (y + half) * right_stride + half + k
+    right_stride: int
+    left_sum: NDArray[np.int32]  # sum over the window, element y * W + x
+    left_scale: NDArray[np.float32]  # steps / sqrt(variance), 0 where there is none
+    right_sum: NDArray[np.int32]  # element y * right_width + k
+    right_scale: NDArray[np.float32]  # 1 / sqrt(variance), 0 where there is none
+    right_width: int
+    steps: int
+    sums: NDArray[np.int32]  # column sums of the products around row `at`, element (half + x) * P + d
+    at: NDArray[np.int64]  # (1,): the row whose column sums are held, or -1
+
+
+@COSTS.register("zncc")
+@dataclass(frozen=True)
+class Zncc:
+    """``min(1 - rho, 1)`` in `steps` levels, rho the correlation of the two windows.
+
+    Parameters
+    ----------
+    window : int
+        Side of the square window in pixels, odd, 3 or more.
+    steps : int
+        The cost 1 as an integer, 1 to 254.
+    """
+
+    window: int = 5
+    steps: int = 63
+    name: ClassVar[str] = "zncc"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.window, int) or self.window < 3 or self.window % 2 == 0:
+            raise OptionError(f"window of zncc must be an odd integer of at least 3, got {self.window!r}")
+        if self.window > 255:
+            raise OptionError(f"window of zncc must be at most 255, got {self.window}")
+        if not isinstance(self.steps, int) or not 1 <= self.steps <= 254:
+            raise OptionError(f"steps of zncc must be an integer from 1 to 254, got {self.steps!r}")
+
+    @property
+    def cost_max(self) -> int:
+        """Largest cost."""
+        return self.steps
+
+    @property
+    def range_max(self) -> int:
+        """Largest grey range for which the numerator fits 32 bits."""
+        return int(2 * np.sqrt(2.0**31 - 1) / (self.window * self.window))
+
+    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[ZnccRows]:
+        """Compute the window statistics; return the row producers of `workers` sweeps."""
+        half = self.window // 2
+        height, width = pair.left.shape
+        padded = pair.levels.padded
+        pair = Pair(
+            self._in_range(pair.left), self._in_range(pair.right), pair.left_bad, pair.right_bad,
+            pair.levels, pair.outside, pair.threads,
+        )  # fmt: skip
+        left, right = pad_pair(pair, half, workspace)
+        right_width = width + padded
+        left_sum = workspace.array("zncc.left_sum", (height, width), np.int32)
+        left_scale = workspace.array("zncc.left_scale", (height, width), np.float32)
+        right_sum = workspace.array("zncc.right_sum", (height, right_width), np.int32)
+        right_scale = workspace.array("zncc.right_scale", (height, right_width), np.float32)
+        tasks: list[Any] = []
+        for y0, y1 in spans(height, pair.threads):
+            tasks.append(
+                lambda y0=y0, y1=y1: _statistics(left, y0, y1, self.window, self.steps, left_sum, left_scale)
+            )
+            tasks.append(
+                lambda y0=y0, y1=y1: _statistics(right, y0, y1, self.window, 1, right_sum, right_scale)
+            )
+        run(tasks, pair.threads)
+        cells = cells_of(pair, self.cost_max, workspace)
+        rows = []
+        for worker in range(workers):
+            sums = workspace.array(f"zncc.sums{worker}", (width + 2 * half) * padded, np.int32)
+            at = workspace.array(f"zncc.at{worker}", 1, np.int64)
+            at[0] = -1
+            rows.append(
+                ZnccRows(
+                    cells, half, left.ravel(), left.shape[1], right.ravel(), right.shape[1], left_sum.ravel(),
+                    left_scale.ravel(), right_sum.ravel(), right_scale.ravel(), right_width, self.steps, sums, at,
+                )  # fmt: skip
+            )
+        return rows
+
+    def _in_range(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Return `image` scaled, if need be, so that its range is at most `range_max`: rho does not change."""
+        if image.dtype == np.uint8 and self.range_max >= 255:
+            return image
+        low, high = int(image.min()), int(image.max())
+        if high - low <= self.range_max and high < 2**15:
+            return image
+        factor = min(1.0, self.range_max / max(high - low, 1))
+        return np.rint((image.astype(np.float64) - low) * factor).astype(np.uint16)
+
+
+@kernel
+def _statistics(
+    image: NDArray[Any], y0: int, y1: int, window: int, scale: int, out_sum: NDArray[np.int32],
+    out_scale: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Window sums and scale / sqrt(variance) of rows y0..y1; columns beyond the output's width are not read."""
+    width = out_sum.shape[1]
+    sums = np.zeros(width + window - 1, np.int64)
+    squares = np.zeros(width + window - 1, np.int64)
+    for y in range(y0, y1):
+        if y == y0:
+            for row in range(y, y + window):
+                for k in range(sums.size):
+                    value = np.int64(image[row, k])
+                    sums[k] += value
+                    squares[k] += value * value
+        else:
+            for k in range(sums.size):
+                new = np.int64(image[y + window - 1, k])
+                old = np.int64(image[y - 1, k])
+                sums[k] += new - old
+                squares[k] += new * new - old * old
+        total = np.int64(0)
+        square = np.int64(0)
+        for k in range(window - 1):
+            total += sums[k]
+            square += squares[k]
+        for x in range(width):
+            total += sums[x + window - 1]
+            square += squares[x + window - 1]
+            variance = np.int64(window * window) * square - total * total
+            out_sum[y, x] = np.int32(total)
+            out_scale[y, x] = np.float32(scale / np.sqrt(np.float64(variance))) if variance > 0 else np.float32(0)
+            total -= sums[x]
+            square -= squares[x]
+
+
+@inline
+def _slide(rows: ZnccRows, image_row: int, sign: int) -> None:
+    """Add (sign 1) or take away (-1) the products of one padded image row to or from the column sums."""
+    cells = rows.cells
+    left = image_row * rows.left_stride
+    right = image_row * rows.right_stride
+    kind = np.int32(0)
+    for c in range(cells.width + 2 * rows.half):
+        mine = splat(np.int32(sign * np.int32(rows.left[left + c])))
+        k = right + cells.width - 1 + 2 * rows.half - c
+        for block in range(0, cells.padded, LANES):
+            product = multiply(mine, convert(load(rows.right, k + block), kind))
+            at = c * cells.padded + block
+            store(rows.sums, at, add(load(rows.sums, at), product))
+
+
+@inline
+def _move(rows: ZnccRows, y: int) -> None:
+    """Bring the column sums to row `y`: one row in and one out when it is a neighbour of the last one."""
+    window = 2 * rows.half + 1
+    last = rows.at[0]
+    if last >= 0 and y == last + 1:
+        _slide(rows, y + window - 1, 1)
+        _slide(rows, last, -1)
+    elif last >= 0 and y == last - 1:
+        _slide(rows, y, 1)
+        _slide(rows, last + window - 1, -1)
+    elif y != last:
+        rows.sums[:] = 0
+        for row in range(y, y + window):
+            _slide(rows, row, 1)
+    rows.at[0] = y
+
+
+@implements(ZnccRows)
+@kernel
+def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
+    _move(rows, y)
+    cells = rows.cells
+    window = 2 * rows.half + 1
+    count = splat(np.int32(window * window))
+    most = splat(np.float32(rows.steps))
+    half = splat(np.float32(0.5))
+    zero = splat(np.float32(0))
+    for block in range(0, cells.padded, LANES):
+        total = load(rows.sums, block)
+        for c in range(1, window):
+            total = add(total, load(rows.sums, c * cells.padded + block))
+        for x in range(cells.width):
+            k = y * rows.right_width + cells.width - 1 - x + block
+            mine = splat(rows.left_sum[y * cells.width + x])
+            numerator = subtract(multiply(count, total), multiply(mine, load(rows.right_sum, k)))
+            scale = multiply(splat(rows.left_scale[y * cells.width + x]), load(rows.right_scale, k))
+            rho = maximum(multiply(convert(numerator, np.float32(0)), scale), zero)
+            cost = maximum(add(subtract(most, minimum(rho, most)), half), zero)
+            store(out, x * cells.padded + block, convert(cost, np.uint8(0)))
+            if x + 1 < cells.width:
+                total = add(total, load(rows.sums, (x + window) * cells.padded + block))
+                total = subtract(total, load(rows.sums, x * cells.padded + block))
+    close_row(cells, y, out)

@@ -1,0 +1,1 @@
+"""What the compiled stages share: compiler flags and vector types."""

@@ -1,0 +1,31 @@
+"""The one home of numba's flags.
+
+Every kernel is compiled on first use for the types that it meets, kept in numba's disk cache, releases the
+interpreter lock so that plain threads run it side by side, and divides as numpy does (no zero-division
+exception inside loops). There is no ``fastmath``: results must not depend on the processor. There is no
+``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.pool` runs
+several of them at once, which is safe from any number of calling threads and compiles in half the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+
+__all__ = ["inline", "kernel"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(function: F) -> F:
+    """Compile `function` as a kernel that Python code calls."""
+    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return compiled
+
+
+def inline(function: F) -> F:
+    """Compile `function` as a helper that kernels call and that is always inlined into them."""
+    compiled: F = numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
+    return compiled

@@ -1,0 +1,373 @@
+"""Vector values for numba: 64 lanes of one integer or float type, written once for every processor.
+
+A `Vector` is a numba type whose value is one LLVM vector, ``<64 x i8>`` and so on. LLVM splits or widens it to
+what the processor has (two registers of AVX2, four of NEON or SSE), so there is one source and the same result
+everywhere: the integer operations are exact and the float ones are single IEEE operations, never contracted.
+
+The functions of this module can be called from compiled code only. They take flat arrays and offsets in
+elements; nothing checks bounds.
+
+Layout of a row of costs or path costs (one row of the image, `W` pixels, `D` disparity levels padded to
+``P = 64 * ceil(D / 64)``)::
+
+    offset  0 .. P-1        P .. 2P-1       ...    (W-1)P .. WP-1
+            pixel x = 0     pixel x = 1            pixel x = W-1
+            d = 0 1 2 ...   d = 0 1 2 ...
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import binding, ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, register_model
+
+__all__ = [
+    "LANES",
+    "Vector",
+    "add",
+    "add_saturated",
+    "aligned",
+    "convert",
+    "count_bits",
+    "either",
+    "first_bit",
+    "less_bit",
+    "load",
+    "lowest",
+    "lowest_of_3",
+    "mask_equal",
+    "maximum",
+    "minimum",
+    "multiply",
+    "multiply_q15",
+    "shift_down",
+    "shift_up",
+    "splat",
+    "store",
+    "subtract",
+    "vector_bits",
+    "xor",
+]
+
+LANES = 64
+"""Disparity levels that one vector value holds."""
+
+_I32 = ir.IntType(32)
+
+
+class Vector(types.Type):  # type: ignore[misc]
+    """The numba type of `LANES` values of one scalar type."""
+
+    def __init__(self, scalar: Any) -> None:
+        self.scalar = scalar
+        super().__init__(name=f"Vector({LANES} x {scalar})")
+
+    @property
+    def is_float(self) -> bool:
+        """Whether the lanes are floating point."""
+        return isinstance(self.scalar, types.Float)
+
+    @property
+    def llvm(self) -> ir.VectorType:
+        """The LLVM type."""
+        return ir.VectorType(self.element, LANES)
+
+    @property
+    def element(self) -> ir.Type:
+        """The LLVM type of one lane."""
+        return ir.FloatType() if self.is_float else ir.IntType(self.scalar.bitwidth)
+
+    @property
+    def suffix(self) -> str:
+        """How LLVM's intrinsics name the type."""
+        return f"v{LANES}{'f32' if self.is_float else f'i{self.scalar.bitwidth}'}"
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Vector) -> None:
+        super().__init__(manager, kind, kind.llvm)
+
+
+def vector_bits() -> int:
+    """Return the width in bits of the processor's widest vectors that the compiler will use."""
+    features = binding.get_host_cpu_features()
+    if features.get("avx512bw"):
+        return 512
+    if features.get("avx2"):
+        return 256
+    return 128
+
+
+def _splat_ir(builder: Any, scalar: Any, kind: Vector) -> Any:
+    empty = ir.Constant(kind.llvm, ir.Undefined)
+    first = builder.insert_element(empty, scalar, ir.Constant(_I32, 0))
+    return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES))
+
+
+def _call(builder: Any, name: str, result: Any, args: list[Any]) -> Any:
+    signature = ir.FunctionType(result, [a.type for a in args])
+    return builder.call(cgutils.get_or_insert_function(builder.module, signature, name), args)
+
+
+def _pointer(context: Any, builder: Any, kind: Any, array: Any, offset: Any) -> Any:
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [offset]), ir.PointerType(Vector(kind.dtype).llvm))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load(typing: Any, array: Any, offset: Any) -> Any:
+    """Return `LANES` elements of the flat `array` from `offset` on."""
+    size = array.dtype.bitwidth // 8
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.load(_pointer(context, builder, signature.args[0], args[0], args[1]), align=size)
+
+    return Vector(array.dtype)(array, types.intp), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store(typing: Any, array: Any, offset: Any, value: Any) -> Any:
+    """Write the lanes of `value` into the flat `array` from `offset` on."""
+    if not isinstance(value, Vector) or value.scalar != array.dtype:
+        return None
+    size = array.dtype.bitwidth // 8
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store(args[2], _pointer(context, builder, signature.args[0], args[0], args[1]), align=size)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def splat(typing: Any, scalar: Any) -> Any:
+    """Return a vector whose lanes all hold `scalar`, of the scalar's own type."""
+    kind = Vector(scalar)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _splat_ir(builder, args[0], kind)
+
+    return kind(scalar), generate
+
+
+def _binary(name: str, doc: str, integer: Any, floating: Any = None) -> Any:
+    def define(typing: Any, a: Any, b: Any) -> Any:
+        if not isinstance(a, Vector) or a != b or (a.is_float and floating is None):
+            return None
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return (floating if a.is_float else integer)(builder, a, *args)
+
+        return a(a, b), generate
+
+    define.__name__ = name
+    define.__doc__ = doc
+    return intrinsic(define)
+
+
+def _llvm(unsigned: str, signed: str = "") -> Any:
+    def build(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
+        name = signed if signed and kind.scalar.signed else unsigned
+        return _call(builder, f"llvm.{name}.{kind.suffix}", kind.llvm, [x, y])
+
+    return build
+
+
+def _least_float(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
+
+
+def _most_float(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", x, y), x, y)
+
+
+def _q15(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
+    wide = ir.VectorType(_I32, LANES)
+
+    def constant(value: int) -> Any:
+        return ir.Constant(wide, [value] * LANES)
+
+    product = builder.mul(builder.sext(x, wide), builder.sext(y, wide))
+    # The form in which LLVM recognises one instruction of x86: ((product >> 14) + 1) >> 1.
+    rounded = builder.lshr(builder.add(builder.lshr(product, constant(14)), constant(1)), constant(1))
+    return builder.trunc(rounded, kind.llvm)
+
+
+add = _binary(
+    "add", "Return a + b, wrapping.", lambda b, k, x, y: b.add(x, y), lambda b, k, x, y: b.fadd(x, y)
+)
+subtract = _binary(
+    "subtract", "Return a - b, wrapping.", lambda b, k, x, y: b.sub(x, y), lambda b, k, x, y: b.fsub(x, y)
+)
+multiply = _binary(
+    "multiply", "Return a * b, wrapping.", lambda b, k, x, y: b.mul(x, y), lambda b, k, x, y: b.fmul(x, y)
+)
+multiply_q15 = _binary(
+    "multiply_q15", "Return (a * b + 2**14) >> 15 of int16 lanes: b is a factor in [0, 1) times 2**15.", _q15
+)
+add_saturated = _binary(
+    "add_saturated", "Return a + b, held at the type's largest value.", _llvm("uadd.sat", "sadd.sat")
+)
+minimum = _binary("minimum", "Return the smaller of a and b.", _llvm("umin", "smin"), _least_float)
+maximum = _binary("maximum", "Return the larger of a and b.", _llvm("umax", "smax"), _most_float)
+xor = _binary("xor", "Return the exclusive or of the bits.", lambda b, k, x, y: b.xor(x, y))
+either = _binary("either", "Return the bits set in a or in b.", lambda b, k, x, y: b.or_(x, y))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def less_bit(typing: Any, a: Any, b: Any, bit: Any) -> Any:
+    """Return `bit` (a ``uint8``) in the ``uint8`` lanes where a < b, and 0 elsewhere."""
+    result = Vector(types.uint8)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        x, y, value = args
+        lower = builder.icmp_unsigned("<", x, y)
+        zero = ir.Constant(result.llvm, [0] * LANES)
+        return builder.select(lower, _splat_ir(builder, value, result), zero)
+
+    return result(a, b, types.uint8), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def count_bits(typing: Any, value: Any) -> Any:
+    """Return the number of bits set in each lane."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _call(builder, f"llvm.ctpop.{value.suffix}", value.llvm, [args[0]])
+
+    return value(value), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def convert(typing: Any, value: Any, like: Any) -> Any:
+    """Return `value` with its lanes converted to the scalar type of `like` (a scalar; its value is unused).
+
+    Integers wrap or widen, floats are cut towards zero: they must lie within the integer's range.
+    """
+    target = Vector(like)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        source = args[0]
+        if value.is_float and not target.is_float:
+            wide = builder.fptosi(source, ir.VectorType(_I32, LANES))
+            return wide if target.scalar.bitwidth == 32 else builder.trunc(wide, target.llvm)
+        if target.is_float and not value.is_float:
+            return (builder.sitofp if value.scalar.signed else builder.uitofp)(source, target.llvm)
+        if target.scalar.bitwidth > value.scalar.bitwidth:
+            return (builder.sext if value.scalar.signed else builder.zext)(source, target.llvm)
+        if target.scalar.bitwidth < value.scalar.bitwidth:
+            return builder.trunc(source, target.llvm)
+        return source
+
+    return target(value, like), generate
+
+
+def _shuffle(name: str, doc: str, lanes: list[int]) -> Any:
+    def define(typing: Any, a: Any, b: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return builder.shuffle_vector(*args, ir.Constant(ir.VectorType(_I32, LANES), lanes))
+
+        return a(a, b), generate
+
+    define.__name__ = name
+    define.__doc__ = doc
+    return intrinsic(define)
+
+
+shift_up = _shuffle(
+    "shift_up",
+    "Return lane d - 1 at lane d; lane 0 takes the last lane of `a`, the block before.",
+    [LANES - 1 + i for i in range(LANES)],
+)
+shift_down = _shuffle(
+    "shift_down",
+    "Return lane d + 1 at lane d; the last lane takes lane 0 of `b`, the block behind.",
+    [i + 1 for i in range(LANES)],
+)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def lowest(typing: Any, value: Any) -> Any:
+    """Return the smallest lane of an integer vector."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind = "smin" if value.scalar.signed else "umin"
+        return _call(builder, f"llvm.vector.reduce.{kind}.{value.suffix}", value.element, [args[0]])
+
+    return value.scalar(value), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def lowest_of_3(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """Return the smallest lanes of three ``uint8`` vectors in the three low bytes of a ``uint32``.
+
+    One tree for the three costs hardly more than one alone: the vectors are interleaved as they are halved.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def shuffle(x: Any, y: Any, lanes: list[int]) -> Any:
+            return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(_I32, len(lanes)), lanes))
+
+        def least(x: Any, y: Any) -> Any:
+            n = x.type.count
+            return _call(builder, f"llvm.umin.v{n}i8", ir.VectorType(ir.IntType(8), n), [x, y])
+
+        def unpack(size: int, high: bool) -> list[int]:
+            # Within each 16 byte part, alternate groups of `size` bytes of the two sources (x86 "unpack").
+            lanes: list[int] = []
+            for part in range(0, LANES, 16):
+                for k in range(0, 8, size):
+                    at = part + (8 if high else 0) + k
+                    lanes += [at + i for i in range(size)] + [LANES + at + i for i in range(size)]
+            return lanes
+
+        def zip_least(x: Any, y: Any, size: int) -> Any:
+            return least(shuffle(x, y, unpack(size, False)), shuffle(x, y, unpack(size, True)))
+
+        first, second, third = args
+        value = zip_least(zip_least(first, second, 1), zip_least(third, third, 1), 2)  # a b c c  a b c c ...
+        for n in (32, 16):
+            none = ir.Constant(value.type, ir.Undefined)
+            value = least(shuffle(value, none, list(range(n))), shuffle(value, none, list(range(n, 2 * n))))
+        for n in (8, 4):
+            none = ir.Constant(value.type, ir.Undefined)
+            value = least(value, shuffle(value, none, [(n + i) % 16 for i in range(16)]))
+        packed = builder.bitcast(value, ir.VectorType(_I32, 4))
+        return builder.extract_element(packed, ir.Constant(_I32, 0))
+
+    return types.uint32(a, b, c), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def mask_equal(typing: Any, a: Any, b: Any) -> Any:
+    """Return a ``uint64`` whose bit d tells whether lane d of a and b are equal."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(builder.icmp_unsigned("==", *args), ir.IntType(64))
+
+    return types.uint64(a, b), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def first_bit(typing: Any, mask: Any) -> Any:
+    """Return the position of the lowest set bit of a ``uint64`` that is not 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        flag = ir.Constant(ir.IntType(1), 1)
+        return _call(builder, "llvm.cttz.i64", ir.IntType(64), [args[0], flag])
+
+    return types.int64(types.uint64), generate
+
+
+def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray[Any, Any]:
+    """Return an uninitialised C-contiguous array whose first element lies on a 64-byte boundary."""
+    count = int(np.prod(shape))
+    size = np.dtype(dtype).itemsize
+    raw = np.empty(count * size + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + count * size].view(dtype).reshape(shape)

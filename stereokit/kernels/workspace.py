@@ -1,0 +1,59 @@
+"""Buffers that are kept from one call to the next.
+
+A matcher owns a `Pool`. Each call takes a `Workspace` out, and puts it back when it ends, so that calls from
+several threads never share a buffer and a steady stream of equal frames allocates nothing.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from stereokit.kernels.simd import aligned
+
+__all__ = ["Pool", "Workspace"]
+
+
+class Workspace:
+    """Named arrays, allocated when first asked for and reused while shape and type stay the same."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, np.ndarray[Any, Any]] = {}
+
+    def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray[Any, Any]:
+        """Return the array called `name`, C-contiguous and 64-byte aligned; its content is whatever it was."""
+        shape = (shape,) if isinstance(shape, int) else shape
+        held = self._arrays.get(name)
+        if held is None or held.shape != shape or held.dtype != np.dtype(dtype):
+            self._arrays.pop(name, None)  # free the old one before the new one is made
+            held = self._arrays[name] = aligned(shape, dtype)
+        return held
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return sum(a.nbytes for a in self._arrays.values())
+
+
+class Pool:
+    """Workspaces of one matcher: as many as there were calls at the same time."""
+
+    def __init__(self) -> None:
+        self._free: list[Workspace] = []
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def take(self) -> Iterator[Workspace]:
+        """Lend a workspace for the length of a ``with`` block."""
+        with self._lock:
+            workspace = self._free.pop() if self._free else Workspace()
+        try:
+            yield workspace
+        finally:
+            with self._lock:
+                self._free.append(workspace)

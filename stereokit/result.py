@@ -1,0 +1,152 @@
+"""What a matcher returns: the disparity map, what was measured in it, how sure it is, and what to do with it.
+
+The colours are Google's Turbo map (Mikhailov 2019, as in OpenCV): it runs from dark blue (far) to dark red
+(near) without the false edges of a rainbow, and black is left for pixels without a value.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereokit import io
+from stereokit.calibration import Calibration
+from stereokit.errors import InputError, OptionError
+
+__all__ = ["Disparity", "colorize"]
+
+
+@dataclass(frozen=True, eq=False)
+class Disparity:
+    """A disparity map of the left view.
+
+    Parameters
+    ----------
+    disparity : (H, W) float32
+        Pixels, NaN where invalid. Dense after a fill.
+    valid : (H, W) bool
+        True where the disparity was measured, False where it was filled or is invalid.
+    confidence : (H, W) float32, optional
+        From 0, no better than another disparity, to 1.
+    right : (H, W) float32, optional
+        The map of the right view, pixels, NaN where invalid.
+
+    Raises
+    ------
+    InputError
+        If an array has another type or shape.
+    """
+
+    disparity: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    confidence: NDArray[np.float32] | None = None
+    right: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        _check("disparity", self.disparity, np.float32, None)
+        shape = self.disparity.shape
+        _check("valid", self.valid, np.bool_, shape)
+        if self.confidence is not None:
+            _check("confidence", self.confidence, np.float32, shape)
+        if self.right is not None:
+            _check("right", self.right, np.float32, shape)
+
+    @property
+    def density(self) -> float:
+        """The share of pixels that were measured, from 0 to 1."""
+        return float(np.count_nonzero(self.valid) / self.valid.size)
+
+    def depth(self, calibration: Calibration) -> NDArray[np.float32]:
+        """Return the depth, (H, W) float32 in metres, NaN where there is none.
+
+        Filled pixels have a depth too; mask with `valid` to keep measured ones only.
+        """
+        return calibration.disparity_to_depth(self.disparity)
+
+    def points(self, calibration: Calibration) -> NDArray[np.float32]:
+        """Return the points in the left camera's frame, (H, W, 3) float32 metres, NaN where there is none."""
+        return calibration.points(self.disparity)
+
+    def color(self, min: float = 0.0, max: float | None = None) -> NDArray[np.uint8]:
+        """Return the map as a picture, (H, W, 3) uint8 RGB; see `colorize`.
+
+        Parameters
+        ----------
+        min, max : float
+            Disparities of the first and the last colour, pixels. `max` defaults to the 99th percentile; fix
+            it for video, so that colours keep their meaning.
+        """
+        return colorize(self.disparity, min, max)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write `disparity` as ``.png`` (KITTI), ``.pfm``, ``.npy`` or ``.tiff``.
+
+        See `stereokit.io.write_disparity`. Filled values are written like measured ones.
+
+        Raises
+        ------
+        FileError
+            If the suffix is unknown or the file cannot be written.
+        """
+        io.write_disparity(path, self.disparity)
+
+
+def colorize(disparity: ArrayLike, low: float = 0.0, high: float | None = None) -> NDArray[np.uint8]:
+    """Return a disparity map in Turbo colours.
+
+    Parameters
+    ----------
+    disparity : (H, W) float
+        Pixels, not finite where invalid.
+    low, high : float
+        Disparities of the first and the last colour, pixels; what lies outside takes the end's colour. `high`
+        defaults to the 99th percentile of the valid values.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        RGB, black where invalid.
+
+    Raises
+    ------
+    InputError
+        If `disparity` is not a 2-d array of floats.
+    OptionError
+        If `high` is not above `low` or one is not finite.
+    """
+    values = np.asarray(disparity)
+    if values.ndim != 2 or values.dtype.kind != "f":
+        raise InputError(f"disparity must be (H, W) float, got {values.dtype} of shape {values.shape}")
+    known = np.isfinite(values)
+    if high is None:
+        top = float(np.percentile(values[known], 99)) if known.any() else low
+        high = top if top > low else low + 1
+    if not (np.isfinite(low) and np.isfinite(high) and high > low):
+        raise OptionError(f"high must be finite and above low, got low={low}, high={high}")
+    span = (np.where(known, values, low).astype(np.float32) - np.float32(low)) / np.float32(high - low)
+    colors: NDArray[np.uint8] = _turbo()[np.rint(np.clip(span, 0, 1) * 255).astype(np.uint8)]
+    colors[~known] = 0
+    return colors
+
+
+@lru_cache(maxsize=1)
+def _turbo() -> NDArray[np.uint8]:
+    steps = np.arange(256, dtype=np.uint8)[:, None]
+    return np.ascontiguousarray(cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, 0, ::-1], dtype=np.uint8)
+
+
+def _check(name: str, array: Any, dtype: type[np.generic], shape: tuple[int, ...] | None) -> None:
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{name} must be a numpy array, got {type(array).__name__}")
+    if array.dtype != dtype:
+        raise InputError(f"{name} must be {np.dtype(dtype)}, got {array.dtype}")
+    if shape is None and (array.ndim != 2 or array.size == 0):
+        raise InputError(f"{name} must be (H, W) and not empty, got shape {array.shape}")
+    if shape is not None and array.shape != shape:
+        raise InputError(f"{name} must have the shape of disparity, {shape}, got {array.shape}")

@@ -1,0 +1,173 @@
+"""Winner takes all with sub-pixel interpolation (StereoVAE paper, equation 6) and a confidence.
+
+The level with the lowest aggregated cost wins, the lowest of equals. A parabola through it and its two neighbours
+gives the fraction of a pixel. Confidence is the margin to the best competitor that is not a neighbour,
+``(c2 - c1) / c2``: 0 where another disparity is as good, towards 1 where there is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import InputError, OptionError
+from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.simd import LANES, first_bit, load, lowest, mask_equal, minimum, splat
+
+__all__ = ["Winners", "Wta", "select", "select_row", "winners_like"]
+
+
+class Winners(NamedTuple):
+    """What selection writes, all ``(H, W)`` and flat for kernels."""
+
+    disparity: NDArray[np.float32]  # pixels
+    cost: NDArray[Any]  # aggregated cost of the winner
+    confidence: NDArray[np.float32]  # or empty, when nobody asked for it
+    levels: int
+    minimum: int
+    subpixel: bool
+
+
+@dataclass(frozen=True)
+class Wta:
+    """Options of selection.
+
+    Parameters
+    ----------
+    subpixel : bool
+        Whether to interpolate between levels by a parabola.
+    """
+
+    subpixel: bool = True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.subpixel, bool):
+            raise OptionError(f"subpixel must be True or False, got {self.subpixel!r}")
+
+
+@inline
+def _best_level(keys: NDArray[Any], at: int, padded: int) -> tuple[Any, int]:
+    """The smallest key of the levels from `at` on, and the first level that has it."""
+    smallest = load(keys, at)
+    for block in range(LANES, padded, LANES):
+        smallest = minimum(smallest, load(keys, at + block))
+    value = lowest(smallest)
+    wanted = splat(value)
+    level = np.int64(0)
+    for back in range(0, padded, LANES):
+        block = padded - LANES - back
+        mask = mask_equal(load(keys, at + block), wanted)
+        if mask != np.uint64(0):
+            level = block + first_bit(mask)
+    return value, level
+
+
+@inline
+def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int, to: int, out: Winners) -> None:
+    """Write the winner among the levels from element `at` on to element `to` of the maps.
+
+    `keys` are integers in the order of `values`: `values` itself, or the bits of non-negative floats.
+    """
+    key, level = _best_level(keys, at, padded)
+    best = np.float32(values[at + level])
+    disparity = np.float32(level + out.minimum)
+    if out.subpixel and level > 0 and level < out.levels - 1:
+        before = np.float32(values[at + level - 1])
+        behind = np.float32(values[at + level + 1])
+        bend = before + behind - np.float32(2) * best
+        if bend > np.float32(0):
+            disparity += (before - behind) / (np.float32(2) * bend)
+    out.disparity[to] = disparity
+    out.cost[to] = values[at + level]
+    if out.confidence.size > 0:
+        first = max(level - 1, 0)
+        behind_last = min(level + 2, out.levels)
+        held_0 = keys[at + first]
+        held_1 = keys[at + level]
+        held_2 = keys[at + behind_last - 1]
+        most = keys.dtype.type(2 ** (8 * keys.itemsize - 1) - 1)
+        keys[at + first] = most
+        keys[at + level] = most
+        keys[at + behind_last - 1] = most
+        _, other = _best_level(keys, at, padded)
+        rival = np.float32(values[at + other])
+        keys[at + level] = held_1
+        keys[at + first] = held_0
+        keys[at + behind_last - 1] = held_2
+        alone = other >= out.levels or (other >= first and other < behind_last)
+        if alone:
+            out.confidence[to] = np.float32(1)
+        elif rival > np.float32(0):
+            out.confidence[to] = (rival - best) / rival
+        else:
+            out.confidence[to] = np.float32(0)
+
+
+@kernel
+def select_row(keys: NDArray[Any], values: NDArray[Any], width: int, padded: int, to: int, out: Winners) -> None:
+    """Select all pixels of one row of aggregated costs, ``(W, P)`` flat, into the maps from element `to` on."""
+    for x in range(width):
+        select_pixel(keys, values, x * padded, padded, to + x, out)
+
+
+def winners_like(
+    disparity: NDArray[np.float32], cost: NDArray[Any], confidence: NDArray[np.float32] | None,
+    levels: int, minimum_disparity: int, subpixel: bool,
+) -> Winners:  # fmt: skip
+    """Return the flat view of the maps that kernels write."""
+    flat = np.empty(0, np.float32) if confidence is None else confidence.ravel()
+    return Winners(disparity.ravel(), cost.ravel(), flat, levels, minimum_disparity, subpixel)
+
+
+def select(
+    volume: NDArray[Any], *, min_disparity: int = 0, subpixel: bool = True
+) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[np.float32]]:
+    """Select the disparity of every pixel of a volume of aggregated costs.
+
+    Parameters
+    ----------
+    volume : (H, W, D) uint16, int16 or float32, not negative
+        Aggregated costs, as `stereokit.aggregate` returns them.
+    min_disparity : int
+        Disparity of level 0, pixels.
+    subpixel : bool
+        Whether to interpolate between levels.
+
+    Returns
+    -------
+    disparity : (H, W) float32, pixels
+    cost : (H, W), dtype of the volume
+        Aggregated cost of the winner.
+    confidence : (H, W) float32 in [0, 1]
+
+    Raises
+    ------
+    InputError
+        If the volume has another shape or type.
+    """
+    if volume.ndim != 3 or volume.dtype not in (np.uint16, np.int16, np.float32) or 0 in volume.shape:
+        raise InputError(
+            f"volume must be a non-empty (H, W, D) array of uint16, int16 or float32, "
+            f"got {volume.dtype} {volume.shape}"
+        )
+    height, width, count = volume.shape
+    padded = -(-count // LANES) * LANES
+    disparity = np.empty((height, width), np.float32)
+    cost = np.empty((height, width), volume.dtype)
+    confidence = np.empty((height, width), np.float32)
+    out = winners_like(disparity, cost, confidence, count, min_disparity, subpixel)
+    worst = np.iinfo(volume.dtype).max if volume.dtype.kind in "iu" else np.finfo(volume.dtype).max
+    row = np.full((width, padded), worst, volume.dtype)
+    for y in range(height):
+        row[:, :count] = volume[y]
+        values = row.ravel()
+        select_row(keys_of(values), values, width, padded, y * width, out)
+    return disparity, cost, confidence
+
+
+def keys_of(values: NDArray[Any]) -> NDArray[Any]:
+    """Return integers that sort as non-negative `values` do, sharing their memory."""
+    return values.view(np.int32) if values.dtype == np.float32 else values

@@ -1,1 +1,40 @@
-"""Placeholder while the stages are written."""
+"""Classical stereo matching in plain Python: Census and ZNCC costs, SGM and domain-transform aggregation.
+
+>>> import stereokit
+>>> disparity = stereokit.match(left, right, method="zncc+sgm")  # doctest: +SKIP
+"""
+
+from stereokit.calibration import Calibration
+from stereokit.costs import Census, RowCost, Zncc
+from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
+from stereokit.matching import METHODS, Matcher, match, warmup
+from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
+from stereokit.result import Disparity
+from stereokit.selection import select
+from stereokit.stages import aggregate, cost_volume
+
+__all__ = [
+    "AGGREGATIONS",
+    "COSTS",
+    "METHODS",
+    "REFINERS",
+    "Calibration",
+    "Census",
+    "Disparity",
+    "FileError",
+    "InputError",
+    "Matcher",
+    "OptionError",
+    "RowCost",
+    "StereokitError",
+    "UnknownNameError",
+    "Zncc",
+    "__version__",
+    "aggregate",
+    "cost_volume",
+    "match",
+    "select",
+    "warmup",
+]
+
+__version__ = "0.1.0"

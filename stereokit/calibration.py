@@ -2,8 +2,8 @@
 
 Both cameras share ``fx``, ``fy`` and ``cy``. With ``d = x_left - x_right`` and principal points ``cx0`` and
 ``cx1``, a point at depth ``Z`` obeys ``d + (cx1 - cx0) = fx * baseline_m / Z``; Middlebury calls the term in
-brackets ``doffs``. ``Q`` is the same statement as the matrix of ``cv2.reprojectImageTo3D`` (Bradski & Kaehler,
-Learning OpenCV, ch. 12).
+brackets ``doffs``. ``Q`` is the same statement as the matrix of ``cv2.reprojectImageTo3D`` (Bradski and
+Kaehler, Learning OpenCV, ch. 12).
 
 Files: Middlebury ``calib.txt`` (2014 and later, ETH3D too; baseline in millimetres), KITTI
 ``calib_cam_to_cam.txt`` and per-frame files (``P = K [I | t]``; the devkit's ``b = -P[0, 3] / fx``), and a

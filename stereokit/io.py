@@ -1,7 +1,7 @@
 """Files: images, disparity maps (KITTI 16-bit PNG, PFM, npy, float TIFF), OpenCV's fixed point, PLY clouds.
 
 Sources: KITTI stereo devkit (``readme.txt``, ``io_disp.h``: ``uint16 = disparity * 256``, 0 is invalid); the
-PFM of Middlebury 2014 (rows bottom-up, the sign of the scale gives the byte order, its magnitude is not used);
+PFM of Middlebury 2014 (rows bottom-up, the sign of the scale gives the byte order, its magnitude is unused);
 OpenCV's ``StereoMatcher::DISP_SHIFT`` (16 steps a pixel, invalid is one pixel below the minimum).
 
 Every writer builds the whole file first, writes it to a temporary name beside the target and then renames it,
@@ -53,7 +53,7 @@ _PFM_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([-+]?[0-9.]+(?:[eE][-+]?\
 _STEPS = 16  # of OpenCV's fixed point in a pixel
 
 
-def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...], name: str = "path") -> Path:
+def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = (), name: str = "path") -> Path:
     """Return `path`, checked before any work is done for it: known suffix, existing folder.
 
     Parameters
@@ -61,7 +61,7 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...], name: 
     path : path
         A file that is to be written.
     suffixes : tuple of str
-        The suffixes that are known, lower case with their dot.
+        The suffixes that are known, lower case with their dot; empty to take any.
     name : str
         What the message calls the argument.
 
@@ -71,7 +71,7 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...], name: 
         If the suffix is unknown, the folder is missing or `path` is a folder.
     """
     target = Path(path)
-    if target.suffix.lower() not in suffixes:
+    if suffixes and target.suffix.lower() not in suffixes:
         raise FileError(f"{name} must end in one of {', '.join(suffixes)}, got {str(path)!r}")
     if not target.parent.is_dir():
         raise FileError(f"{name} {str(path)!r}: the folder {str(target.parent)!r} does not exist")

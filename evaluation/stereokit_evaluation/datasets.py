@@ -234,7 +234,9 @@ def _levels(path: Path, levels: int, widest: int) -> NDArray[np.float32]:
         raise FileError(
             f"{path} must be at most {widest} px wide at {levels} levels a pixel, got {image.shape[1]}"
         )
-    return np.where(image == 0, np.float32(np.nan), image.astype(np.float32) / np.float32(levels))
+    disparity: NDArray[np.float32] = image.astype(np.float32) / np.float32(levels)
+    disparity[image == 0] = np.nan
+    return disparity
 
 
 def _masked(load_map: Loader, mask: Path) -> NDArray[np.float32]:

@@ -6,8 +6,8 @@ column counts only the images that have its ground truth. For scripts there is `
 
 from __future__ import annotations
 
-import ast
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit.errors import FileError, OptionError
 from stereokit.io import write_bytes, write_image
 from stereokit_evaluation.datasets import load, select
 from stereokit_evaluation.errormap import error_map
@@ -46,6 +46,7 @@ __all__ = ["Result", "evaluate", "run"]
 _DEFAULT_METHOD = "zncc+sgm"
 _DEFAULT_DISPARITIES = 128
 _BAR_AFTER_S = 1.0
+_OWN_OPTIONS = frozenset(("method", "scale", "refiner", "device", "threads", "max_disparity"))
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def evaluate(
     refiner: Annotated[str | None, typer.Option(help="Refiner for the half-size map.")] = None,
     predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
-    set_: Annotated[
+    settings: Annotated[
         list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")
     ] = None,
     max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
@@ -76,65 +77,83 @@ def evaluate(
     color: Annotated[bool, typer.Option("--color/--gray", help="Images as stored, or grey.")] = False,
     count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
     error_maps: Annotated[Path | None, typer.Option(help="Write error maps to METHOD/NAME.png here.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them.")
+    ] = None,
 ) -> None:
-    """Score matching methods, or finished disparity maps, against ground truth as KITTI 2015 does."""
-    try:
-        if json_file is not None and (json_file.is_dir() or not json_file.absolute().parent.is_dir()):
-            raise FileError(f"json must name a file in an existing folder, got {str(json_file)!r}")
-        chosen = select(load(dataset, root, count=count), frames)
-        if predictions is not None:
-            given = {"method": method, "refiner": refiner, "set": set_, "threads": threads}
-            for name in (name for name, value in given.items() if value):
-                raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")
-            runs = [_Run(from_files(predictions), "predictions")]
-            options: dict[str, Any] = {"predictions": str(predictions)}
-        else:
-            suggested = [frame.max_disparity for frame in chosen if frame.max_disparity is not None]
-            options = {
-                "max_disparity": max_disparity or max(suggested, default=_DEFAULT_DISPARITIES),
-                "threads": threads,
-                **_parse(set_ or ()),
-            }
-            names = method or [_DEFAULT_METHOD]
-            runs = [_matcher_run(name, scale, refiner, device, options, color) for name in names]
-        results, interrupted = _execute(runs, chosen, error_maps)
-        _print_table(f"{dataset}, {len(chosen)} frames", runs, results)
-        skipped = list(dict.fromkeys(skip for result in results for skip in result.skipped))
+    """Score matching methods, or finished disparity maps, against ground truth as KITTI 2015 does.
+
+    Frames that cannot be read are named on standard error and left out; the exit status is then 1.
+    """
+    _check_json(json_file)
+    chosen = select(load(dataset, root, count=count), frames)
+    options: dict[str, Any]
+    if predictions is not None:
+        given = {"method": method, "refiner": refiner, "set": settings, "threads": threads}
+        for name in (name for name, value in given.items() if value):
+            raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")
+        options = {"predictions": str(predictions)}
+        runs = [_Run(from_files(predictions), "predictions")]
+    else:
+        suggested = [frame.max_disparity for frame in chosen if frame.max_disparity is not None]
+        if max_disparity is None:
+            max_disparity = max(suggested, default=_DEFAULT_DISPARITIES)
+        options = {"max_disparity": max_disparity, "threads": threads, **_parse(settings or ())}
+        methods = method or [_DEFAULT_METHOD]
+        runs = [_matcher_run(name, scale, refiner, device, options, color) for name in methods]
+    results, interrupted = _execute(runs, chosen, error_maps)
+    skipped = list(dict.fromkeys(skip for result in results for skip in result.skipped))
+    document = {
+        "results": [_as_json(job, result) for job, result in zip(runs, results, strict=False)],
+        "dataset": dataset,
+        "options": {**options, "color": color, "frames": frames},
+        "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in skipped],
+        "interrupted": interrupted,
+        "version": _version(),
+    }
+    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
+    if str(json_file) == "-":
+        typer.echo(text, nl=False)
+    else:
         if json_file is not None:
-            document = {
-                "results": [_as_json(job, result) for job, result in zip(runs, results, strict=False)],
-                "dataset": dataset,
-                "options": {**options, "color": color, "frames": frames},
-                "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in skipped],
-                "interrupted": interrupted,
-                "version": _version(),
-            }
-            write_bytes(json_file, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
-    except StereokitError as error:
-        typer.echo(f"Error: {error}", err=True)
-        raise typer.Exit(2) from error
+            write_bytes(json_file, text.encode())
+        _print_table(f"{dataset}, {len(chosen)} frames", runs, results)
     if interrupted:
         raise typer.Exit(130)
     if skipped:
         raise typer.Exit(1)
 
 
+def _check_json(path: Path | None) -> None:
+    if path is None or str(path) == "-":
+        return
+    if path.is_dir() or not path.parent.is_dir():
+        raise FileError(f"json must name a file in an existing folder, got {str(path)!r}")
+
+
 def _parse(pairs: Sequence[str]) -> dict[str, Any]:
-    """Read ``key=value`` options; values are Python numbers, true, false and none, or else words."""
-    words = {"true": True, "false": False, "none": None}
     options: dict[str, Any] = {}
     for pair in pairs:
         key, equals, text = pair.partition("=")
         key = key.strip().replace("-", "_")
         if not equals or not key.isidentifier():
             raise OptionError(f"set must be key=value, got {pair!r}")
-        value = text.strip()
-        try:
-            options[key] = words[value.lower()] if value.lower() in words else ast.literal_eval(value)
-        except (ValueError, SyntaxError):
-            options[key] = value
+        if key in _OWN_OPTIONS:
+            raise OptionError(f"set must not hold {key}, which has an option of its own, got {pair!r}")
+        options[key] = _value(text.strip())
     return options
+
+
+def _value(text: str) -> int | float | bool | str | None:
+    for kind in (int, float):
+        try:
+            value = kind(text)
+        except ValueError:
+            continue
+        if math.isfinite(value):
+            return value
+    words = {"true": True, "false": False, "none": None}
+    return words.get(text.lower(), text)
 
 
 def _matcher_run(
@@ -142,9 +161,6 @@ def _matcher_run(
 ) -> _Run:
     from stereokit import Matcher
 
-    taken = {"method", "scale", "refiner", "device"} & options.keys()
-    if taken:
-        raise OptionError(f"set must not hold what has an option of its own, got {sorted(taken)[0]!r}")
     matcher = Matcher(method, scale=scale, refiner=refiner, device=device, **options)
     estimate = with_matcher(matcher, gray=not color)
     return _Run(estimate, str(matcher.method), scale, refiner, str(matcher.device))
@@ -171,7 +187,7 @@ def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -
                             told.add(outcome)
                     step(f"{job.method} {outcome.name}")
             except KeyboardInterrupt:
-                console.print("interrupted; figures cover the frames that were done", highlight=False)
+                console.print("interrupted: the figures cover the frames done so far", highlight=False)
                 return [*results, Result(tuple(scored), tuple(skipped))], True
             results.append(Result(tuple(scored), tuple(skipped)))
     return results, False

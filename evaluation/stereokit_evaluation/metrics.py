@@ -241,7 +241,8 @@ def outliers(error: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (error / np.abs(truth)).astype(np.float64)  # float32 quotient, float64 comparison
-    return (error > np.float32(D1_PIXELS)) & (share > D1_SHARE)
+    bad: NDArray[np.bool_] = (error > np.float32(D1_PIXELS)) & (share > D1_SHARE)
+    return bad
 
 
 def tally(error: NDArray[np.float32], truth: NDArray[np.float32]) -> Tally:

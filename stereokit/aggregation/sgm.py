@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.aggregation._paths import PathBuffers, first_visit, last_visit_row, start
-from stereokit.costs.rows import Levels
+from stereokit.costs.rows import Cost, Levels
 from stereokit.errors import OptionError
+from stereokit.inputs import check_number
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.pool import run
 from stereokit.kernels.simd import LANES
@@ -37,17 +38,19 @@ class Sgm:
 
     Parameters
     ----------
-    p1 : float
-        Penalty for a step of one level, as a share of the cost's range.
-    p2 : float
-        Penalty for a larger step, as a share of the cost's range.
+    p1 : float or None
+        Penalty for a step of one level, in the cost's own unit: neighbours that differ for census, the scale of
+        ``C = min(1 - rho, 1)`` for ZNCC. None takes 0.2 times the cost's range.
+    p2 : float or None
+        Penalty for a larger step, in the same unit. None takes 2.5 times the range. Costs and p2 together must
+        not exceed 255 steps of the 8-bit path costs.
     paths : {8, 5, 4}
         Directions: all eight; the five that need only one sweep (all but those from below; one thread and next to
         no memory); left, right, up and down.
     """
 
-    p1: float = 0.19
-    p2: float = 2.5
+    p1: float | None = None
+    p2: float | None = None
     paths: int = 8
     name: ClassVar[str] = "sgm"
     total_dtype: ClassVar[Any] = np.uint16
@@ -56,19 +59,24 @@ class Sgm:
         if self.paths not in (4, 5, 8):
             raise OptionError(f"paths must be 4, 5 or 8, got {self.paths!r}")
 
-    def penalties(self, cost_max: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return P1 and P2 by grey difference between the two pixels of a step, each (256,)."""
-        p1 = int(round(self.p1 * cost_max))
-        p2 = int(round(self.p2 * cost_max))
-        if not 0 <= p1 <= p2:
-            raise OptionError(f"p1 must be from 0 to p2, got p1={self.p1} and p2={self.p2}")
-        if cost_max + p2 > 255:
-            most = (255 - cost_max) / cost_max
-            raise OptionError(f"p2 must be at most {most:.3g} for costs up to {cost_max}, got {self.p2}")
-        return np.full(256, p1, np.uint8), np.full(256, p2, np.uint8)
+    def penalties(self, cost_max: int, unit: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return P1 and P2 by grey difference between the two pixels of a step, in steps of cost, each (256,).
+
+        Raises
+        ------
+        OptionError
+            If p1 is not from 0 to p2, or p2 does not fit 8-bit path costs.
+        """
+        p1 = 0.2 * cost_max / unit if self.p1 is None else check_number("p1", self.p1, 0, 255)
+        p2 = 2.5 * cost_max / unit if self.p2 is None else check_number("p2", self.p2, 0, 255)
+        if p1 > p2:
+            raise OptionError(f"p1 must be at most p2, got p1={p1:g} and p2={p2:g}")
+        if cost_max + round(p2 * unit) > 255:
+            raise OptionError(f"p2 must be at most {(255 - cost_max) / unit:.4g} with this cost, got {p2:g}")
+        return np.full(256, round(p1 * unit), np.uint8), np.full(256, round(p2 * unit), np.uint8)
 
     def sweep(
-        self, rows: list[Any], levels: Levels, cost_max: int, guide: NDArray[np.uint8], workspace: Workspace,
+        self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
         threads: int, out: Winners, total: NDArray[np.uint16] | None = None,
     ) -> None:  # fmt: skip
         """Aggregate the rows of two producers and select.
@@ -79,8 +87,8 @@ class Sgm:
             One per sweep.
         levels : Levels
             Disparities.
-        cost_max : int
-            Largest cost.
+        cost : Cost
+            The cost that produces the rows; its range and unit scale the penalties.
         guide : (H, W) uint8
             The left image, which the penalties may follow.
         workspace : Workspace
@@ -92,7 +100,7 @@ class Sgm:
         total : (H, W, P) uint16 or None
             Where the sums over all paths go, if they are wanted.
         """
-        p1, p2 = self.penalties(cost_max)
+        p1, p2 = self.penalties(cost.cost_max, cost.unit)
         height, width = guide.shape
         size = width * levels.padded
         diagonals = self.paths != 4

@@ -63,6 +63,11 @@ class Census:
         width, height = _WINDOWS[self.window]
         return width * height - 1
 
+    @property
+    def unit(self) -> int:
+        """Penalties are given in neighbours that differ: one unit of cost."""
+        return 1
+
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[CensusRows]:
         """Transform both images; return the row producers of `workers` sweeps."""
         height, width = pair.left.shape

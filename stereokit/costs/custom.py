@@ -49,6 +49,11 @@ class RowCost:
         """Return itself: a row cost has no options, so it is its own factory in the registry."""
         return self
 
+    @property
+    def unit(self) -> int:
+        """Penalties are given in units of cost."""
+        return 1
+
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[VolumeRows]:
         """Compute the cost volume; return its rows for `workers` sweeps."""
         height, width = pair.left.shape

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numba import types
@@ -33,7 +33,7 @@ from stereokit.kernels.pool import run, spans
 from stereokit.kernels.simd import LANES, either, load, maximum, minimum, splat, store
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["WORST", "Levels", "Pair", "Cells", "VolumeRows", "close_row", "cost_row", "implements", "pad_pair", "cells_of"]
+__all__ = ["WORST", "Cells", "Cost", "Levels", "Pair", "VolumeRows", "close_row", "cost_row", "implements", "pad_pair", "cells_of", "produce_volume"]
 
 WORST = np.uint8(255)
 """Cost of the levels that pad a row to a multiple of `LANES`; it saturates and can never win."""
@@ -78,6 +78,25 @@ class Pair:
     levels: Levels
     outside: float | None
     threads: int = 1
+
+
+class Cost(Protocol):
+    """What a matching cost offers: its range, the unit of its penalties, and rows."""
+
+    @property
+    def name(self) -> str:
+        """Name in the registry."""
+
+    @property
+    def cost_max(self) -> int:
+        """Largest cost, 1 to 254."""
+
+    @property
+    def unit(self) -> int:
+        """Steps of cost per unit in which users give penalties."""
+
+    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[Any]:
+        """Prepare an image pair; return a row producer, a named tuple, for each of `workers` sweeps."""
 
 
 class Cells(NamedTuple):
@@ -209,6 +228,21 @@ def pad_pair(pair: Pair, margin: int, workspace: Workspace) -> tuple[NDArray[Any
         tasks.append(lambda y0=y0, y1=y1: _pad(pair.right, y0, y1, margin, start, right))  # type: ignore[misc]
     run(tasks, pair.threads)
     return left, right
+
+
+def produce_volume(rows: list[Any], shape: tuple[int, int], levels: Levels, threads: int) -> NDArray[np.uint8]:
+    """Return the costs of all rows, ``(H, W, D)``; one row producer per thread."""
+    height, width = shape
+    padded = np.empty((height, width * levels.padded), np.uint8)
+    parts = spans(height, threads)
+    run([lambda k=k, y=y: _produce(rows[k], *y, padded) for k, y in enumerate(parts)], threads)  # type: ignore[misc]
+    return np.ascontiguousarray(padded.reshape(height, width, levels.padded)[:, :, : levels.count])
+
+
+@kernel
+def _produce(rows: Any, y0: int, y1: int, out: NDArray[np.uint8]) -> None:
+    for y in range(y0, y1):
+        cost_row(rows, y, out[y])
 
 
 class VolumeRows(NamedTuple):

@@ -80,6 +80,11 @@ class Zncc:
         return self.steps
 
     @property
+    def unit(self) -> int:
+        """Penalties are given on the scale of C = min(1 - rho, 1), which `steps` units of cost make up."""
+        return self.steps
+
+    @property
     def range_max(self) -> int:
         """Largest grey range for which the numerator fits 32 bits."""
         return int(2 * np.sqrt(2.0**31 - 1) / (self.window * self.window))

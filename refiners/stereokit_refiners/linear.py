@@ -1,0 +1,41 @@
+"""Linear upscaling: the setting "Mini + Linear" of the StereoVAE paper.
+
+A disparity of d half-size pixels is 2 d full-size pixels. Pixel centres are kept: half-size pixel ``i`` covers the
+full-size pixels ``2 i`` and ``2 i + 1``. Odd sizes were extended by one before halving, so the result is cropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.result import Disparity
+
+__all__ = ["Linear"]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Bilinear upscaling by two; the left image is used for its size only."""
+
+    def __call__(self, coarse: Disparity, left: NDArray[Any]) -> Disparity:
+        """Return the map at the size of `left`; see `stereokit_refiners.refiner.Refiner`."""
+        height, width = left.shape
+
+        def upscale(image: NDArray[Any], method: int) -> NDArray[Any]:
+            size = (2 * image.shape[1], 2 * image.shape[0])
+            full = np.asarray(cv2.resize(image, size, interpolation=method)).reshape(size[1], size[0])
+            return np.ascontiguousarray(full[:height, :width])
+
+        disparity = upscale(coarse.disparity, cv2.INTER_LINEAR) * np.float32(2)
+        valid = upscale(coarse.valid.view(np.uint8), cv2.INTER_NEAREST).astype(bool)
+        valid &= ~np.isnan(disparity)
+        confidence = None
+        if coarse.confidence is not None:
+            confidence = upscale(coarse.confidence, cv2.INTER_LINEAR)
+            confidence[~valid] = 0
+        return Disparity(disparity, valid, confidence)

@@ -1,0 +1,266 @@
+"""Domain-transform aggregation: recursive edge-aware smoothing of every disparity slice.
+
+Two published forms under one name:
+
+``mode="rf"``
+    The recursive filter of Gastal and Oliveira 2011 (section 5.2, equation 21), guided by the left grey image.
+    With ``t = 1 + (sigma_s / sigma_r) * |I'|``, pass i of N uses ``sigma_i = sigma_s * sqrt(3) * 2**(N-i) /
+    sqrt(4**N - 1)``, ``a = exp(-sqrt(2) / sigma_i)`` and ``J[n] = I[n] + a**t * (J[n-1] - I[n])``, forward then
+    backward, rows then columns.
+``mode="sum"``
+    The cascade of the StereoVAE authors' CUDA code: one pass left to right, right to left, down, up, each
+    ``A(p) = C(p) + w * A(p - 1)`` with ``w = exp(-|dI| / 52)``; vertically w is 0.8 where ``|dI| < 5``.
+
+Rows are filtered as the cost produces them and written to the one volume; then narrow bands of columns are swept
+down and up, and the upward sweep selects as it goes. Rows and bands are independent of one another, so any number
+of threads gives the same result.
+
+``rf`` runs in 16-bit fixed point, costs with 7 fractional bits and weights with 15: half the memory of floats and
+the same result on every processor. The rounding stays far below one unit of cost. ``sum`` grows without bound and
+runs in float32. `stereokit.aggregate` takes float volumes too and filters them in float32.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numba import types
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from stereokit.costs.rows import Cost, Levels, cost_row
+from stereokit.errors import OptionError
+from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.pool import run, spans
+from stereokit.kernels.simd import LANES, add, convert, load, multiply, multiply_q15, splat, store, subtract
+from stereokit.kernels.workspace import Workspace
+from stereokit.registry import AGGREGATIONS
+from stereokit.selection.wta import Winners, keys_of, select_pixel
+
+__all__ = ["Dt", "edge_weights"]
+
+_FRACTION = 128
+"""Fixed-point costs: units per unit of cost. Costs reach 255, so 7 bits are what int16 leaves."""
+
+
+class Weights(NamedTuple):
+    """Feedback by grey difference of the step, of one pass: (256,) float32, or int16 times 2**15."""
+
+    row: NDArray[Any]
+    column: NDArray[Any]
+    keep: NDArray[Any]  # (1,): 1 for the normalised recursion, 0 for the plain sum
+
+
+@AGGREGATIONS.register("dt")
+@dataclass(frozen=True)
+class Dt:
+    """Edge-aware recursive smoothing.
+
+    Parameters
+    ----------
+    sigma_s : float
+        Spatial scale in pixels (``rf``).
+    sigma_r : float
+        Range scale in grey levels of 0..255 (``rf``).
+    passes : int
+        Passes N over the image (``rf``), 1 to 5.
+    mode : {"rf", "sum"}
+        Which of the two published forms.
+    """
+
+    sigma_s: float = 20.0
+    sigma_r: float = 30.0
+    passes: int = 1
+    mode: str = "rf"
+    name: ClassVar[str] = "dt"
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("rf", "sum"):
+            raise OptionError(f"mode of dt must be 'rf' or 'sum', got {self.mode!r}")
+        for name in ("sigma_s", "sigma_r"):
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
+                raise OptionError(f"{name} must be a positive number, got {value!r}")
+        if not isinstance(self.passes, int) or not 1 <= self.passes <= 5:
+            raise OptionError(f"passes must be an integer from 1 to 5, got {self.passes!r}")
+
+    @property
+    def total_dtype(self) -> Any:
+        """Type of the aggregated costs of ``uint8`` rows."""
+        return np.int16 if self.mode == "rf" else np.float32
+
+    def weights(self, dtype: Any) -> list[Weights]:
+        """Return the feedback of each pass."""
+        if self.mode == "sum":
+            row, column = edge_weights()
+            return [Weights(row, column, np.zeros(1, np.float32))]
+        result = []
+        for i in range(1, self.passes + 1):
+            sigma = self.sigma_s * math.sqrt(3) * 2.0 ** (self.passes - i) / math.sqrt(4.0**self.passes - 1)
+            a = math.exp(-math.sqrt(2) / sigma)
+            table = [a ** (1 + self.sigma_s / self.sigma_r * jump) for jump in range(256)]
+            if dtype == np.int16:
+                fixed = np.array([min(round(w * 2**15), 2**15 - 1) for w in table], np.int16)
+            else:
+                fixed = np.array(table, np.float32)
+            result.append(Weights(fixed, fixed, np.ones(1, fixed.dtype)))
+        return result
+
+    def sweep(
+        self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
+        threads: int, out: Winners, total: NDArray[Any] | None = None, volume: NDArray[Any] | None = None,
+    ) -> None:  # fmt: skip
+        """Aggregate the rows of a producer and select; parameters as of `stereokit.aggregation.sgm.Sgm.sweep`.
+
+        `volume` are float32 costs ``(H, W, P)`` to filter, in place, instead of those of `rows`.
+        """
+        height, width = guide.shape
+        padded = levels.padded
+        dtype = self.total_dtype if volume is None else np.dtype(np.float32)
+        if volume is None:
+            costs = workspace.array("dt.volume", height * width * padded, dtype)
+        else:
+            costs = volume.reshape(-1)
+        keep = np.empty(0, dtype) if total is None else total.reshape(-1)
+        passes = self.weights(dtype)
+        # A band is narrow enough for its columns to stay in the caches between the way down and the way up.
+        band = max(1, min(width, 2**20 // max(1, height * padded * costs.itemsize)))
+        bands = spans(width, -(-width // band))
+        band = max(x1 - x0 for x0, x1 in bands)
+        for number, weights in enumerate(passes):
+            last = number == len(passes) - 1
+
+            def filter_rows(k: int, y0: int, y1: int, weights: Weights = weights, number: int = number) -> None:
+                if number == 0 and volume is None:
+                    cost = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
+                    _produce_rows(rows[k], padded, guide, weights, y0, y1, cost, costs)
+                else:
+                    _filter_rows(padded, guide, weights, y0, y1, costs)
+
+            def filter_bands(
+                k: int, part: list[tuple[int, int]], weights: Weights = weights, last: bool = last
+            ) -> None:
+                column = workspace.array(f"dt.band{k}", height * band * padded, dtype)
+                state = workspace.array(f"dt.state{k}", band * padded, dtype)
+                for x0, x1 in part:
+                    _filter_band(
+                        padded, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep
+                    )
+
+            parts = spans(height, min(threads, len(rows)))
+            run([lambda k=k, y=y: filter_rows(k, *y) for k, y in enumerate(parts)], threads)  # type: ignore[misc]
+            shares = [bands[k::threads] for k in range(min(threads, len(bands)))]
+            run([lambda k=k, s=s: filter_bands(k, s) for k, s in enumerate(shares)], threads)  # type: ignore[misc]
+
+
+def edge_weights() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the feedback of the authors' cascade by grey difference, along rows and along columns, (256,)."""
+    row = np.array([math.exp(-jump / 52) for jump in range(256)], np.float32)
+    column = row.copy()
+    column[:5] = 0.8
+    return row, column
+
+
+def _feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
+    """value + weight * (before - keep * value), for vectors of int16 or float32; compiled code only."""
+    raise NotImplementedError("compiled code only")
+
+
+@overload(_feed_back, strict=False, jit_options={"forceinline": True})
+def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
+    if value.scalar == types.int16:
+        return lambda value, before, weight, keep: add(value, multiply_q15(subtract(before, value), weight))
+    return lambda value, before, weight, keep: add(
+        value, multiply(weight, subtract(before, multiply(keep, value)))
+    )
+
+
+@inline
+def _jump(guide: NDArray[np.uint8], y: int, x: int, y2: int, x2: int) -> int:
+    return abs(np.int32(guide[y, x]) - np.int32(guide[y2, x2]))
+
+
+@inline
+def _filter_row(padded: int, guide: NDArray[np.uint8], weights: Weights, y: int, base: int, row: NDArray[Any]) -> None:
+    """Forward, then backward along one row of levels at ``row[base:]``, in place."""
+    width = guide.shape[1]
+    keep = splat(weights.keep[0])
+    for x in range(1, width):
+        weight = splat(weights.row[_jump(guide, y, x, y, x - 1)])
+        at = base + x * padded
+        for block in range(0, padded, LANES):
+            value = _feed_back(load(row, at + block), load(row, at - padded + block), weight, keep)
+            store(row, at + block, value)
+    for back in range(1, width):
+        x = width - 1 - back
+        weight = splat(weights.row[_jump(guide, y, x + 1, y, x)])
+        at = base + x * padded
+        for block in range(0, padded, LANES):
+            value = _feed_back(load(row, at + block), load(row, at + padded + block), weight, keep)
+            store(row, at + block, value)
+
+
+@kernel
+def _produce_rows(
+    rows: Any, padded: int, guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int,
+    cost: NDArray[np.uint8], costs: NDArray[Any],
+) -> None:  # fmt: skip
+    """Costs of rows y0..y1, filtered along the row, into the volume."""
+    width = guide.shape[1]
+    like = costs[0]
+    unit = splat(costs.dtype.type(_FRACTION if costs.itemsize == 2 else 1))
+    for y in range(y0, y1):
+        cost_row(rows, y, cost)
+        base = y * width * padded
+        for at in range(0, width * padded, LANES):
+            store(costs, base + at, multiply(convert(load(cost, at), like), unit))
+        _filter_row(padded, guide, weights, y, base, costs)
+
+
+@kernel
+def _filter_rows(
+    padded: int, guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int, costs: NDArray[Any]
+) -> None:
+    for y in range(y0, y1):
+        _filter_row(padded, guide, weights, y, y * guide.shape[1] * padded, costs)
+
+
+@kernel
+def _filter_band(
+    padded: int, guide: NDArray[np.uint8], weights: Weights, x0: int, x1: int, costs: NDArray[Any],
+    column: NDArray[Any], state: NDArray[Any], keys: NDArray[Any], last: bool, out: Winners,
+    total: NDArray[Any],
+) -> None:  # fmt: skip
+    """Down, then up the columns x0..x1; select on the way up of the last pass, else write the costs back."""
+    height, width = guide.shape
+    size = (x1 - x0) * padded
+    keep = splat(weights.keep[0])
+    for y in range(height):
+        base = (y * width + x0) * padded
+        for x in range(x0, x1):
+            weight = splat(weights.column[_jump(guide, y, x, max(y - 1, 0), x)])
+            for at in range((x - x0) * padded, (x - x0 + 1) * padded, LANES):
+                value = load(costs, base + at)
+                if y > 0:
+                    value = _feed_back(value, load(state, at), weight, keep)
+                store(state, at, value)
+                store(column, y * size + at, value)
+    for back in range(height):
+        y = height - 1 - back
+        base = (y * width + x0) * padded
+        for x in range(x0, x1):
+            weight = splat(weights.column[_jump(guide, min(y + 1, height - 1), x, y, x)])
+            for at in range((x - x0) * padded, (x - x0 + 1) * padded, LANES):
+                value = load(column, y * size + at)
+                if back > 0:
+                    value = _feed_back(value, load(state, at), weight, keep)
+                store(state, at, value)
+                if not last:
+                    store(costs, base + at, value)
+                elif total.size > 0:
+                    store(total, base + at, value)
+            if last:
+                select_pixel(keys, state, (x - x0) * padded, padded, y * width + x, out)

@@ -1,0 +1,23 @@
+"""What the methods are called and how they are set when nobody says otherwise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["DEFAULTS", "METHODS"]
+
+METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+sgm"}
+"""The four matchers of the StereoVAE paper."""
+
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "": {
+        "confidence": False,
+        "fill": "background",
+        "median": 3,
+        "outside": 0.5,
+        "right": False,
+        "smp": True,
+        "subpixel": True,
+    },
+}
+"""Options by method; those under the empty name hold for all methods that do not say otherwise."""

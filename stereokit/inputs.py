@@ -1,0 +1,191 @@
+"""The one place where images and options are checked.
+
+Whatever comes in (grey or RGB, 8 or 16 bit or floating point, strided, read-only, with NaN) leaves as two grey
+C-contiguous ``uint8`` or ``uint16`` images and the masks of the pixels that carry no evidence. Nothing that comes in
+is modified. Floating-point images are brought to 16 bits over the finite range that both share; those that hold
+whole numbers from 0 to 255 become what they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import InputError, OptionError, did_you_mean
+
+__all__ = ["GrayPair", "check_flag", "check_integer", "check_names", "check_number", "gray_pair", "half_size"]
+
+_TYPES = (np.uint8, np.uint16, np.float32, np.float64)
+
+
+@dataclass(frozen=True)
+class GrayPair:
+    """Two grey images of one shape and type.
+
+    Attributes
+    ----------
+    left, right : (H, W) uint8 or uint16, C-contiguous
+        Grey values; pixels without evidence hold a neighbour's value.
+    left_bad, right_bad : (H, W) bool or None
+        Pixels that were NaN or infinite; None when there are none.
+    guide : (H, W) uint8
+        The left image in 256 grey levels.
+    """
+
+    left: NDArray[Any]
+    right: NDArray[Any]
+    left_bad: NDArray[np.bool_] | None
+    right_bad: NDArray[np.bool_] | None
+    guide: NDArray[np.uint8]
+
+
+def check_integer(name: str, value: Any, low: int | None = None, high: int | None = None) -> int:
+    """Return `value` as an int if it is a whole number from `low` to `high`, else raise OptionError."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        raise OptionError(f"{name} must be an integer, got {value!r}")
+    if (low is not None and value < low) or (high is not None and value > high):
+        rule = f"at least {low}" if high is None else f"from {low} to {high}"
+        raise OptionError(f"{name} must be {rule}, got {value}")
+    return int(value)
+
+
+def check_number(name: str, value: Any, low: float, high: float) -> float:
+    """Return `value` as a float if it lies from `low` to `high`, else raise OptionError."""
+    wrong = isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.number))
+    if wrong or not low <= value <= high:
+        raise OptionError(f"{name} must be a number from {low:g} to {high:g}, got {value!r}")
+    return float(value)
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return `value` if it is True or False, else raise OptionError."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise OptionError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
+def check_names(kind: str, given: Any, known: Any) -> None:
+    """Raise OptionError with the nearest known name for the first of `given` that is not in `known`."""
+    for name in given:
+        if name not in known:
+            raise OptionError(did_you_mean(kind, str(name), known))
+
+
+def _gray(name: str, image: Any) -> NDArray[Any]:
+    array = np.asarray(image)
+    if array.dtype not in _TYPES:
+        raise InputError(f"{name} must be uint8, uint16, float32 or float64, got {array.dtype}")
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
+        raise InputError(f"{name} must be grey (H, W) or RGB (H, W, 3), got shape {array.shape}")
+    if 0 in array.shape:
+        raise InputError(f"{name} must not be empty, got shape {array.shape}")
+    if array.dtype == np.float64 and array.ndim == 3:
+        return np.asarray(array @ np.array([0.299, 0.587, 0.114]))
+    if array.ndim == 3:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(array), cv2.COLOR_RGB2GRAY))
+    return array
+
+
+def _fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return `image` with bad pixels replaced by the nearest good one before them on the row, else behind."""
+    height, width = image.shape
+    columns = np.where(bad, -1, np.arange(width))
+    before = np.maximum.accumulate(columns, axis=1)
+    columns = np.where(bad, width, np.arange(width))
+    behind = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
+    source = np.where(before >= 0, before, behind)
+    empty = source >= width
+    filled = np.take_along_axis(image, np.where(empty, 0, source), axis=1)
+    filled[empty] = 0
+    return np.asarray(filled)
+
+
+def _integers(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Bring finite floats to whole numbers of 8 or 16 bits, both images alike."""
+    low = min(float(left.min()), float(right.min()))
+    high = max(float(left.max()), float(right.max()))
+    for limit, kind in ((255, np.uint8), (65535, np.uint16)):
+        if low >= 0 and high <= limit:
+            as_is = left.astype(kind), right.astype(kind)
+            if np.array_equal(as_is[0], left) and np.array_equal(as_is[1], right):
+                return as_is
+    if high <= low:
+        return np.zeros(left.shape, np.uint8), np.zeros(right.shape, np.uint8)
+
+    def scale(image: NDArray[Any]) -> NDArray[np.uint16]:
+        share = (image.astype(np.float64) / 2 - low / 2) / (high / 2 - low / 2)  # halves: no overflow
+        return np.rint(share * 65535).astype(np.uint16)
+
+    return scale(left), scale(right)
+
+
+def gray_pair(left: Any, right: Any) -> GrayPair:
+    """Check two images and return them as a grey pair.
+
+    Parameters
+    ----------
+    left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
+        Of one shape (up to colour) and type. Any strides; read-only arrays are fine.
+
+    Raises
+    ------
+    InputError
+        If an image has another shape or type, is empty, or the two differ.
+    """
+    a, b = _gray("left", left), _gray("right", right)
+    if a.shape != b.shape:
+        raise InputError(f"left and right must have the same size, got {a.shape} and {b.shape}")
+    if a.dtype != b.dtype:
+        raise InputError(f"left and right must have the same type, got {a.dtype} and {b.dtype}")
+    bad: list[NDArray[np.bool_] | None] = [None, None]
+    if a.dtype.kind == "f":
+        images = [a, b]
+        for k, image in enumerate(images):
+            finite = np.isfinite(image)
+            if not finite.all():
+                bad[k] = ~finite
+                images[k] = _fill_bad(image, ~finite)
+        a, b = _integers(*images)
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    if a.dtype == np.uint16 and max(int(a.max()), int(b.max())) <= 255:
+        a, b = a.astype(np.uint8), b.astype(np.uint8)
+    return GrayPair(a, b, bad[0], bad[1], _guide(a, b))
+
+
+def _guide(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint8]:
+    if left.dtype == np.uint8:
+        return left
+    low = min(int(left.min()), int(right.min()))
+    high = max(int(left.max()), int(right.max()))
+    scaled = (left.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1))
+    return np.rint(scaled).astype(np.uint8)
+
+
+def half_size(pair: GrayPair) -> GrayPair:
+    """Return the pair at half size, ``(ceil(H/2), ceil(W/2))``: the mean of each 2x2 pixels.
+
+    Odd sizes are extended by their last row or column. A pixel is bad if one of its four is.
+    """
+
+    def shrink(image: NDArray[Any]) -> NDArray[Any]:
+        height, width = image.shape
+        even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        size = (even.shape[1] // 2, even.shape[0] // 2)
+        return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0])
+
+    def shrink_bad(bad: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        if bad is None:
+            return None
+        height, width = bad.shape
+        even = np.pad(bad, ((0, height % 2), (0, width % 2)))
+        return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))
+
+    left, right = shrink(pair.left), shrink(pair.right)
+    guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
+    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide)

@@ -1,0 +1,310 @@
+"""From a method's name to a disparity map: ``"zncc+sgm"`` -> cost, aggregation, selection, post-processing.
+
+A `Matcher` checks its options once, keeps its buffers between calls, and may be called from any number of threads
+at the same time. `match` is the one-line form.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit import costs as _costs  # noqa: F401  (registers the built-in costs)
+from stereokit.aggregation import dt as _dt  # noqa: F401
+from stereokit.aggregation import sgm as _sgm  # noqa: F401
+from stereokit.costs.rows import Levels, Pair
+from stereokit.defaults import DEFAULTS, METHODS
+from stereokit.errors import OptionError, UnknownNameError, did_you_mean
+from stereokit.inputs import GrayPair, check_flag, check_integer, check_names, check_number, gray_pair, half_size
+from stereokit.kernels.pool import available_threads
+from stereokit.kernels.workspace import Pool, Workspace
+from stereokit.postprocess.fill import FILLS, fill
+from stereokit.postprocess.median import median
+from stereokit.postprocess.smp import single_matching_phase
+from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
+from stereokit.result import Disparity
+from stereokit.selection.wta import winners_like
+
+__all__ = ["METHODS", "Matcher", "match", "parse_method", "warmup"]
+
+_MAX_LEVELS = 2048
+_PIPELINE = ("confidence", "fill", "median", "outside", "right", "smp", "subpixel")
+
+
+def parse_method(method: str) -> str:
+    """Return the canonical name, ``"cost+aggregation"``, of a method given in any case, or as S1 to S4.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such method, cost or aggregation.
+    """
+    if not isinstance(method, str):
+        raise OptionError(f"method must be a name such as 'zncc+sgm' or 'S4', got {method!r}")
+    text = method.strip()
+    text = METHODS.get(text.upper(), text.lower())
+    parts = [part.strip() for part in text.split("+")]
+    if len(parts) != 2:
+        known = [*METHODS, *(f"{c}+{a}" for c in COSTS.names() for a in AGGREGATIONS.names())]
+        raise UnknownNameError(did_you_mean("method", method, known))
+    COSTS.get(parts[0])
+    AGGREGATIONS.get(parts[1])
+    return "+".join(parts)
+
+
+def build_cost(name: str, options: dict[str, Any]) -> Any:
+    """Return the cost called `name` with `options`; raise OptionError for those that it does not have."""
+    return _build("cost", COSTS.get(name), options)
+
+
+def build_aggregation(name: str, options: dict[str, Any]) -> Any:
+    """Return the aggregation called `name` with `options`; raise OptionError for those that it does not have."""
+    return _build("aggregation", AGGREGATIONS.get(name), options)
+
+
+def _build(kind: str, factory: Any, options: dict[str, Any]) -> Any:
+    check_names(f"option of this {kind}", options, _option_names(factory))
+    return factory(**options)
+
+
+def _option_names(factory: Any) -> list[str]:
+    return [f.name for f in fields(factory) if f.init] if isinstance(factory, type) else []
+
+
+class Matcher:
+    """A stereo matcher for rectified pairs.
+
+    Parameters
+    ----------
+    method : str
+        ``"cost+aggregation"`` or S1 to S4, any case.
+    max_disparity, min_disparity : int
+        Disparities ``min_disparity <= d < max_disparity`` are tried, in full-size pixels. The minimum may be
+        negative. 1 to 2048 levels.
+    scale : {1.0, 0.5}
+        0.5 matches at half size and lets `refiner` bring the map to full size.
+    refiner : str or None
+        Name of the refiner, for ``scale=0.5``; None is ``"linear"``.
+    device : {"auto", "cpu", "cuda"}
+        Where to compute. There are no CUDA kernels yet: "auto" is the CPU and "cuda" is refused.
+    threads : int or None
+        Threads of one call; None uses the processors at hand. The result does not depend on it.
+    fill : {"background", "nearest"} or None
+        How invalid pixels are filled; None (or ``"none"``) leaves them NaN.
+    **options
+        Options of the stages by name: those of the cost and of the aggregation (see `stereokit.costs.Census`,
+        `Zncc`, `stereokit.aggregation.Sgm`, `Dt`), ``subpixel``, and of the pipeline: ``smp`` (bool, single
+        matching phase), ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of
+        the cost's range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the
+        right view's map too; twice the time). Defaults are those of `stereokit.defaults`.
+
+    Raises
+    ------
+    OptionError
+        If an option does not exist or breaks its rule.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> left = np.random.default_rng(0).integers(0, 256, (20, 60), dtype=np.uint8)
+    >>> right = np.roll(left, -4, axis=1)
+    >>> result = Matcher("census+sgm", max_disparity=16)(left, right)
+    >>> float(np.median(result.disparity))
+    4.0
+    """
+
+    def __init__(
+        self, method: str = "zncc+sgm", *, max_disparity: int = 128, min_disparity: int = 0, scale: float = 1.0,
+        refiner: str | None = None, device: str = "auto", threads: int | None = None, **options: Any,
+    ) -> None:  # fmt: skip
+        self.method = parse_method(method)
+        self.min_disparity = check_integer("min_disparity", min_disparity)
+        self.max_disparity = check_integer("max_disparity", max_disparity, self.min_disparity + 1)
+        if self.max_disparity - self.min_disparity > _MAX_LEVELS:
+            raise OptionError(
+                f"max_disparity - min_disparity must be at most {_MAX_LEVELS}, "
+                f"got {self.max_disparity - self.min_disparity}"
+            )
+        if scale not in (1, 0.5):
+            raise OptionError(f"scale must be 1 or 0.5, got {scale!r}")
+        self.scale = float(scale)
+        if device not in ("auto", "cpu", "cuda"):
+            raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {device!r}")
+        if device == "cuda":
+            raise OptionError("device 'cuda' is not available in this version; use 'cpu' or 'auto'")
+        self.device = "cpu"
+        self.threads = available_threads() if threads is None else check_integer("threads", threads, 1)
+        if refiner is not None and self.scale == 1:
+            raise OptionError(f"refiner needs scale=0.5, got refiner={refiner!r} with scale=1")
+        self.refiner = None if self.scale == 1 else (refiner or "linear").lower()
+        self._refine = None if self.refiner is None else REFINERS.get(self.refiner)()
+        self._set_stages(options)
+        self._pool = Pool()
+
+    def _set_stages(self, options: dict[str, Any]) -> None:
+        cost_name, aggregation_name = self.method.split("+")
+        cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
+        cost_options, aggregation_options = _option_names(cost), _option_names(aggregation)
+        check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options}))
+        merged = {**DEFAULTS[""], **DEFAULTS.get(self.method, {}), **options}
+        self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
+        self.aggregation = aggregation(**{k: merged[k] for k in aggregation_options if k in merged})
+        if hasattr(self.aggregation, "penalties"):
+            self.aggregation.penalties(self.cost.cost_max, self.cost.unit)
+        self.fill = None if merged["fill"] in (None, "none") else merged["fill"]
+        if self.fill is not None and self.fill not in FILLS:
+            raise UnknownNameError(did_you_mean("fill", str(self.fill), (*FILLS, "none")))
+        if merged["median"] not in (0, 3, 5):
+            raise OptionError(f"median must be 0, 3 or 5, got {merged['median']!r}")
+        self.median = int(merged["median"])
+        outside = merged["outside"]
+        self.outside = None if outside is None else check_number("outside", outside, 0, 1)
+        self.smp = check_flag("smp", merged["smp"])
+        self.subpixel = check_flag("subpixel", merged["subpixel"])
+        self.confidence = check_flag("confidence", merged["confidence"])
+        self.right = check_flag("right", merged["right"])
+
+    def __repr__(self) -> str:
+        levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
+        return f"Matcher({self.method!r}, {levels}, scale={self.scale:g}, {self.cost}, {self.aggregation})"
+
+    def __call__(self, left: Any, right: Any) -> Disparity:
+        """Match a rectified pair.
+
+        Parameters
+        ----------
+        left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
+            Grey or RGB, of one size and type; never modified. NaN and infinite pixels count as no evidence.
+
+        Returns
+        -------
+        Disparity
+            Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, if asked for,
+            ``confidence`` and the ``right`` view's map.
+
+        Raises
+        ------
+        InputError
+            If the images cannot be used.
+        """
+        pair = gray_pair(left, right)
+        with self._pool.take() as workspace:
+            full = self._match(pair, workspace)
+            if not self.right:
+                return full
+            mirrored = self._match(_mirror(pair), workspace)
+        other = np.ascontiguousarray(mirrored.disparity[:, ::-1])
+        return Disparity(full.disparity, full.valid, full.confidence, other)
+
+    def _match(self, pair: GrayPair, workspace: Workspace) -> Disparity:
+        if self._refine is None:
+            return self._match_levels(pair, self.min_disparity, self.max_disparity, workspace)
+        low, high = self.min_disparity // 2, -(-self.max_disparity // 2)
+        coarse = self._match_levels(half_size(pair), low, max(high, low + 1), workspace)
+        refined: Disparity = self._refine(coarse, pair.guide)
+        return refined
+
+    def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace) -> Disparity:
+        levels = Levels(low, high - low)
+        shape = pair.left.shape
+        rows = self.cost.prepare(
+            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, self.threads),
+            workspace,
+            max(2, self.threads),
+        )
+        disparity = np.empty(shape, np.float32)
+        cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
+        confidence = np.empty(shape, np.float32) if self.confidence else None
+        out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel)
+        self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, self.threads, out)
+        if pair.left_bad is not None:
+            disparity[pair.left_bad] = np.nan
+        if self.smp:
+            disparity = single_matching_phase(disparity, cost, threads=self.threads)
+        valid = ~np.isnan(disparity)
+        if self.fill is not None:
+            disparity = fill(disparity, self.fill, threads=self.threads)
+        if self.median:
+            disparity = median(disparity, self.median)
+        if confidence is not None:
+            confidence[~valid] = 0
+        return Disparity(disparity, valid, confidence)
+
+
+def _mirror(pair: GrayPair) -> GrayPair:
+    """Return the pair as a camera behind a mirror sees it: the right view becomes the left one."""
+
+    def flip(image: NDArray[Any] | None) -> NDArray[Any] | None:
+        return None if image is None else np.ascontiguousarray(image[:, ::-1])
+
+    left, right = flip(pair.right), flip(pair.left)
+    assert left is not None and right is not None
+    swapped = gray_pair(left, right)
+    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), swapped.guide)
+
+
+_matchers: dict[Any, Matcher] = {}
+_matchers_lock = threading.Lock()
+
+
+def match(left: Any, right: Any, method: str = "zncc+sgm", **options: Any) -> NDArray[np.float32]:
+    """Match a rectified pair and return the left view's disparity map.
+
+    Parameters
+    ----------
+    left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
+        Rectified images of one size and type, grey or RGB.
+    method : str
+        ``"cost+aggregation"`` or S1 to S4.
+    **options
+        Those of `Matcher`.
+
+    Returns
+    -------
+    (H, W) float32, pixels
+        Dense, unless ``fill=None``, which leaves NaN where nothing was measured.
+
+    Raises
+    ------
+    InputError, OptionError
+        If an image or an option cannot be used.
+    """
+    try:
+        key = (method, tuple(sorted(options.items())))
+        hash(key)
+    except TypeError:
+        return Matcher(method, **options)(left, right).disparity
+    with _matchers_lock:
+        matcher = _matchers.pop(key, None) or Matcher(method, **options)
+        _matchers[key] = matcher  # the most recently used is last
+        while len(_matchers) > 4:
+            _matchers.pop(next(iter(_matchers)))
+    return matcher(left, right).disparity
+
+
+def warmup(*methods: str, max_disparity: int = 128) -> None:
+    """Compile ahead (or load from the disk cache) what the methods need, so that no later call waits for it.
+
+    Parameters
+    ----------
+    *methods : str
+        Methods; none means S1 to S4.
+    max_disparity : int
+        As it will be used: code is compiled per 64 levels.
+    """
+    image = np.arange(16 * 16, dtype=np.uint8).reshape(16, 16)
+    for method in methods or METHODS:
+        Matcher(method, max_disparity=max_disparity)(image, image)
+
+
+def _forget_matchers() -> None:
+    _matchers.clear()
+
+
+if hasattr(os, "register_at_fork"):  # buffers of a call that was under way stay with the parent
+    os.register_at_fork(after_in_child=_forget_matchers)

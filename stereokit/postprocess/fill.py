@@ -1,0 +1,89 @@
+"""Filling of invalid pixels along rows.
+
+``"background"`` is the rule of the KITTI development kit: a gap takes the smaller of its two valid ends, because
+what is hidden lies behind what hides it; ends of rows extend outward. ``"nearest"`` is the StereoVAE paper's: the
+closest valid value on the row, the smaller one where both are equally close. Rows without any valid pixel take the
+nearest row that has some (the upper of equals).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import InputError, UnknownNameError, did_you_mean
+from stereokit.kernels.jit import kernel
+from stereokit.kernels.pool import run, spans
+
+__all__ = ["FILLS", "fill"]
+
+FILLS = ("background", "nearest")
+
+
+def fill(
+    disparity: NDArray[np.float32], mode: str = "background", *, threads: int = 1
+) -> NDArray[np.float32]:
+    """Return a copy of the map without gaps.
+
+    Parameters
+    ----------
+    disparity : (H, W) float32, pixels, NaN where invalid
+    mode : {"background", "nearest"}
+        Which end of a gap fills it.
+    threads : int
+        Threads to use; the result does not depend on it.
+
+    Returns
+    -------
+    (H, W) float32, pixels
+        Dense; all NaN if nothing was valid.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such mode.
+    InputError
+        If the map is not two-dimensional.
+    """
+    if mode not in FILLS:
+        raise UnknownNameError(did_you_mean("fill", str(mode), FILLS))
+    if disparity.ndim != 2:
+        raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
+    out = np.array(disparity, np.float32, order="C")
+    nearest = mode == "nearest"
+    parts = spans(out.shape[0], threads)
+    run([lambda y0=y0, y1=y1: _fill_rows(out, y0, y1, nearest) for y0, y1 in parts], threads)  # type: ignore[misc]
+    _fill_empty_rows(out)
+    return out
+
+
+@kernel
+def _fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -> None:
+    width = disparity.shape[1]
+    for y in range(y0, y1):
+        row = disparity[y]
+        last = -1  # the last valid column
+        for x in range(width):
+            if np.isnan(row[x]):
+                continue
+            if last < 0:
+                row[:x] = row[x]
+            elif x - last > 1:
+                low = min(row[last], row[x])
+                for gap in range(last + 1, x):
+                    value = low
+                    if nearest and gap - last != x - gap:
+                        value = row[last] if gap - last < x - gap else row[x]
+                    row[gap] = value
+            last = x
+        if last >= 0:
+            row[last + 1 :] = row[last]
+
+
+def _fill_empty_rows(disparity: NDArray[np.float32]) -> None:
+    empty = np.isnan(disparity[:, 0])
+    if not empty.any() or empty.all():
+        return
+    full = np.flatnonzero(~empty)
+    for y in np.flatnonzero(empty):
+        disparity[y] = disparity[full[np.argmin(np.abs(full - y))]]

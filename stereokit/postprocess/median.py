@@ -1,0 +1,71 @@
+"""Median filter of a disparity map, border replicated, NaN left out.
+
+Dense maps go to OpenCV; where pixels are invalid, the median is over the valid ones of the window (the lower of
+the two middle ones if they are even in number) and an invalid pixel stays invalid.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import InputError, OptionError
+from stereokit.kernels.jit import kernel
+
+__all__ = ["median"]
+
+
+def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]:
+    """Return the median-filtered map.
+
+    Parameters
+    ----------
+    disparity : (H, W) float32, pixels, NaN where invalid
+    size : {3, 5}
+        Side of the window in pixels.
+
+    Returns
+    -------
+    (H, W) float32, pixels, NaN where invalid
+
+    Raises
+    ------
+    OptionError
+        If the size is another.
+    InputError
+        If the map is not two-dimensional.
+    """
+    if size not in (3, 5):
+        raise OptionError(f"size of the median must be 3 or 5, got {size!r}")
+    if disparity.ndim != 2:
+        raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
+    source = np.ascontiguousarray(disparity, np.float32)
+    if not np.isnan(source).any():
+        return np.asarray(cv2.medianBlur(source, size), np.float32).reshape(source.shape)
+    out = np.empty_like(source)
+    _median_of_valid(source, size // 2, out)
+    return out
+
+
+@kernel
+def _median_of_valid(source: NDArray[np.float32], half: int, out: NDArray[np.float32]) -> None:
+    height, width = source.shape
+    held = np.empty((2 * half + 1) ** 2, np.float32)
+    for y in range(height):
+        for x in range(width):
+            if np.isnan(source[y, x]):
+                out[y, x] = np.nan
+                continue
+            count = 0
+            for dy in range(-half, half + 1):
+                for dx in range(-half, half + 1):
+                    value = source[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)]
+                    if not np.isnan(value):
+                        place = count  # insertion sort: at most 25 values
+                        while place > 0 and held[place - 1] > value:
+                            held[place] = held[place - 1]
+                            place -= 1
+                        held[place] = value
+                        count += 1
+            out[y, x] = held[(count - 1) // 2]

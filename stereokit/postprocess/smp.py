@@ -1,0 +1,76 @@
+"""Single matching phase (Di Stefano, Marchionni, Mattoccia 2004; StereoVAE paper, section III).
+
+No right pixel may be matched by two left pixels. The condition as the paper prints it ("<= 1") is inverted: it
+would hold only where pixels collide. Of all left pixels whose match rounds to the same right pixel, the one with
+the lowest aggregated cost stays, of equals the one with the larger disparity; the others become invalid, and so do
+pixels whose match lies outside the right image.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import InputError
+from stereokit.kernels.jit import kernel
+from stereokit.kernels.pool import run, spans
+
+__all__ = ["single_matching_phase"]
+
+
+def single_matching_phase(
+    disparity: NDArray[np.float32], cost: NDArray[Any], *, threads: int = 1
+) -> NDArray[np.float32]:
+    """Return a copy of the left view's map in which no two pixels match the same right pixel.
+
+    Parameters
+    ----------
+    disparity : (H, W) float32, pixels, NaN where invalid
+    cost : (H, W) uint16, int16 or float32
+        Aggregated cost of each pixel's match.
+    threads : int
+        Threads to use; the result does not depend on it.
+
+    Returns
+    -------
+    (H, W) float32, pixels, NaN where invalid
+
+    Raises
+    ------
+    InputError
+        If the two differ in shape.
+    """
+    if disparity.ndim != 2 or disparity.shape != cost.shape:
+        raise InputError(f"cost must have the shape of disparity {disparity.shape}, got {cost.shape}")
+    out = np.array(disparity, np.float32, order="C")
+    cost = np.ascontiguousarray(cost)
+    parts = spans(out.shape[0], threads)
+    run([lambda y0=y0, y1=y1: _resolve(out, cost, y0, y1) for y0, y1 in parts], threads)  # type: ignore[misc]
+    return out
+
+
+@kernel
+def _resolve(disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int) -> None:
+    width = disparity.shape[1]
+    owner = np.empty(width, np.int64)
+    for y in range(y0, y1):
+        row = disparity[y]
+        owner[:] = -1
+        for x in range(width):
+            d = row[x]
+            if not np.isfinite(d):
+                continue
+            xr = np.int64(np.floor(np.float32(x) - d + np.float32(0.5)))
+            if xr < 0 or xr >= width:
+                row[x] = np.nan
+                continue
+            held = owner[xr]
+            if held < 0:
+                owner[xr] = x
+            elif cost[y, x] < cost[y, held] or (cost[y, x] == cost[y, held] and d > row[held]):
+                row[held] = np.nan
+                owner[xr] = x
+            else:
+                row[x] = np.nan

@@ -1,0 +1,125 @@
+"""The stages on whole volumes, for those who reuse the parts.
+
+``select(aggregate(cost_volume(left, right), guide))`` gives what `stereokit.Matcher` gives before post-processing,
+bit for bit: the same compiled code runs over rows of a stored volume instead of rows made on the way.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume
+from stereokit.errors import InputError, OptionError
+from stereokit.inputs import check_integer, check_number, gray_pair
+from stereokit.kernels.pool import available_threads
+from stereokit.kernels.workspace import Workspace
+from stereokit.matching import build_aggregation, build_cost
+from stereokit.selection.wta import winners_like
+
+__all__ = ["aggregate", "cost_volume"]
+
+
+def cost_volume(
+    left: Any, right: Any, cost: str = "zncc", *, max_disparity: int = 128, min_disparity: int = 0,
+    outside: float | None = 1.0, threads: int | None = None, **options: Any,
+) -> NDArray[np.uint8]:  # fmt: skip
+    """Return the matching costs of all pixels and levels.
+
+    Parameters
+    ----------
+    left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
+        Rectified images.
+    cost : str
+        Name of the cost.
+    max_disparity, min_disparity : int
+        Levels ``min_disparity <= d < max_disparity``, pixels.
+    outside : float or None
+        Cost of matches outside the right image as a share of the cost's range; None takes the border pixel.
+    threads : int or None
+        Threads; None uses the processors at hand.
+    **options
+        Those of the cost.
+
+    Returns
+    -------
+    (H, W, D) uint8
+        0 is equal; element ``[y, x, d]`` compares left column x with right column ``x - d - min_disparity``.
+
+    Raises
+    ------
+    InputError, OptionError
+        If an image or an option cannot be used.
+    """
+    stage: Cost = build_cost(cost, options)
+    low = check_integer("min_disparity", min_disparity)
+    levels = Levels(low, check_integer("max_disparity", max_disparity, low + 1) - low)
+    count = available_threads() if threads is None else check_integer("threads", threads, 1)
+    share = None if outside is None else check_number("outside", outside, 0, 1)
+    gray = gray_pair(left, right)
+    pair = Pair(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
+    return produce_volume(stage.prepare(pair, Workspace(), count), gray.left.shape, levels, count)
+
+
+def aggregate(
+    volume: NDArray[Any], guide: Any, aggregation: str = "sgm", *, cost: str | Cost = "zncc",
+    threads: int | None = None, **options: Any,
+) -> NDArray[Any]:  # fmt: skip
+    """Aggregate a volume of costs.
+
+    Parameters
+    ----------
+    volume : (H, W, D) uint8, or float32 for ``"dt"``
+        Costs, as `cost_volume` returns them; not modified.
+    guide : (H, W) uint8
+        The left grey image, along whose edges costs are not mixed.
+    aggregation : str
+        Name of the aggregation.
+    cost : str or Cost
+        The cost that made the volume: its range and unit scale the penalties of ``"sgm"``.
+    threads : int or None
+        Threads; None uses the processors at hand.
+    **options
+        Those of the aggregation.
+
+    Returns
+    -------
+    (H, W, D)
+        ``uint16`` sums over the paths for ``"sgm"``; for ``"dt"`` ``int16`` in 1/128 units of cost with
+        ``mode="rf"``, ``float32`` with ``mode="sum"`` or for a float volume.
+
+    Raises
+    ------
+    InputError, OptionError
+        If the volume, the guide or an option cannot be used.
+    """
+    stage = build_aggregation(aggregation, options)
+    maker: Cost = build_cost(cost, {}) if isinstance(cost, str) else cost
+    volume = np.asarray(volume)
+    floats = volume.dtype == np.float32
+    if volume.ndim != 3 or 0 in volume.shape or not (volume.dtype == np.uint8 or floats):
+        raise InputError(f"volume must be (H, W, D) uint8 or float32, got {volume.dtype} {volume.shape}")
+    if floats and stage.name != "dt":
+        raise InputError("volume must be uint8 for aggregation 'sgm', got float32")
+    guide = np.ascontiguousarray(guide)
+    if guide.dtype != np.uint8 or guide.shape != volume.shape[:2]:
+        raise InputError(f"guide must be uint8 {volume.shape[:2]}, got {guide.dtype} {guide.shape}")
+    count = available_threads() if threads is None else check_integer("threads", threads, 1)
+    if not floats and int(volume.max()) > maker.cost_max:
+        raise OptionError(f"cost {maker.name!r} has costs up to {maker.cost_max}, but the volume has {volume.max()}")
+    height, width, depth = volume.shape
+    levels = Levels(0, depth)
+    total_dtype = np.dtype(np.float32) if floats else np.dtype(stage.total_dtype)
+    total = np.empty((height, width, levels.padded), total_dtype)
+    unused = np.empty((height, width), np.float32), np.empty((height, width), total_dtype)
+    out = winners_like(*unused, None, depth, 0, False)
+    rows = [VolumeRows(np.ascontiguousarray(volume), levels.padded)] * max(2, count)
+    extra: dict[str, Any] = {}
+    if floats:
+        padded = np.zeros((height, width, levels.padded), np.float32)
+        padded[:, :, :depth] = volume
+        extra["volume"] = padded
+    stage.sweep(rows, levels, maker, guide, Workspace(), count, out, total, **extra)
+    return np.ascontiguousarray(total[:, :, :depth])

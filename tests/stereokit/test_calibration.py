@@ -1,0 +1,210 @@
+"""Depth and points against hand-computed numbers and OpenCV; files of each known form."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stereokit.calibration import Calibration, read_calibration
+from stereokit.errors import FileError, InputError, OptionError
+
+DATA = Path(os.environ.get("STEREOKIT_DATA", Path(__file__).parents[3] / "shared" / "data"))
+NAN = np.nan
+SIMPLE = Calibration(fx=100, fy=50, cx0=2, cy=1, baseline_m=0.5)
+
+# Middlebury 2014 Motorcycle, quarter size: the figures of its calib.txt.
+MIDDLEBURY = """cam0=[999.421 0 294.182; 0 999.421 252.932; 0 0 1]
+cam1=[999.421 0 326.96; 0 999.421 252.932; 0 0 1]
+doffs=32.778
+baseline=193.001
+width=741
+height=497
+ndisp=70
+"""
+# KITTI raw, drive of 2011-09-26: the figures of its calib_cam_to_cam.txt.
+KITTI = """calib_time: 09-Jan-2012 13:57:47
+corner_dist: 9.950000e-02
+S_rect_02: 1.242000e+03 3.750000e+02
+P_rect_00: 7.215377e+02 0 6.095593e+02 0 0 7.215377e+02 1.728540e+02 0 0 0 1 0
+P_rect_01: 7.215377e+02 0 6.095593e+02 -3.875744e+02 0 7.215377e+02 1.728540e+02 0 0 0 1 0
+P_rect_02: 721.5377 0 609.5593 4.485728e+01 0 721.5377 1.728540e+02 2.163791e-01 0 0 1 2.745884e-03
+P_rect_03: 721.5377 0 609.5593 -3.395242e+02 0 721.5377 1.728540e+02 2.199936e+00 0 0 1 2.729905e-03
+"""
+
+
+def test_depth_by_hand():
+    disparity = np.array([[50, 5, 0], [-1, NAN, np.inf]], np.float32)
+    depth = SIMPLE.disparity_to_depth(disparity)
+    assert depth.dtype == np.float32
+    np.testing.assert_array_equal(depth, [[1, 10, NAN], [NAN, NAN, NAN]])  # 100 * 0.5 / d
+
+
+def test_depth_with_an_offset_between_the_principal_points():
+    shifted = Calibration(fx=100, fy=100, cx0=2, cy=1, baseline_m=0.5, cx1=7)
+    assert shifted.doffs == 5
+    depth = shifted.disparity_to_depth(np.array([[0.0, 5, -4, -5, -6]]))
+    np.testing.assert_array_equal(depth, [[10, 5, 50, NAN, NAN]])
+
+
+def test_points_by_hand():
+    points = SIMPLE.points(np.full((3, 4), 50, np.float32))
+    assert points.shape == (3, 4, 3)
+    assert points.dtype == np.float32
+    np.testing.assert_allclose(points[1, 2], [0, 0, 1])
+    np.testing.assert_allclose(points[0, 3], [1 / 100, -1 / 50, 1], rtol=1e-6)
+    assert np.isnan(SIMPLE.points(np.zeros((1, 1), np.float32))).all()
+
+
+@pytest.mark.parametrize("cx1", [None, 40.0])
+def test_q_is_what_opencv_expects(cx1):
+    calibration = Calibration(fx=700, fy=690, cx0=31.5, cy=12.25, baseline_m=0.54, cx1=cx1)
+    disparity = np.random.default_rng(1).uniform(1, 90, (17, 23)).astype(np.float32)
+    expected = cv2.reprojectImageTo3D(disparity, calibration.Q)
+    np.testing.assert_allclose(calibration.points(disparity), expected, rtol=2e-5, atol=1e-6)
+    assert calibration.Q.dtype == np.float64
+
+
+def test_tiny_disparity_is_no_depth():
+    assert np.isnan(SIMPLE.disparity_to_depth(np.array([[1e-40]], np.float32))).all()
+
+
+def test_cx1_defaults_to_cx0():
+    assert SIMPLE.cx1 == 2
+    assert SIMPLE.doffs == 0
+
+
+def test_half_size_gives_the_same_points():
+    calibration = Calibration(
+        fx=700, fy=690, cx0=31.5, cy=12.5, baseline_m=0.54, cx1=36.5, width=64, height=32
+    )
+    half = calibration.scaled(0.5)
+    assert (half.width, half.height, half.fx, half.baseline_m, half.cx0) == (32, 16, 350, 0.54, 15.5)
+    assert half.doffs == pytest.approx(2.5)
+    full = calibration.points(np.full((32, 64), 20, np.float32))
+    blocks = full.reshape(16, 2, 32, 2, 3).mean(axis=(1, 3))  # the centre of each 2x2 block
+    np.testing.assert_allclose(half.points(np.full((16, 32), 10, np.float32)), blocks, rtol=1e-4, atol=1e-5)
+    with pytest.raises(OptionError, match="factor"):
+        calibration.scaled(0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("fx", 0), ("fy", -1), ("baseline_m", 0), ("cx0", NAN), ("cx1", np.inf), ("width", 0), ("height", 2.5)],
+)
+def test_bad_numbers_are_named(name, value):
+    with pytest.raises(OptionError, match=name):
+        Calibration(**{"fx": 1, "fy": 1, "cx0": 0, "cy": 0, "baseline_m": 1, name: value})
+
+
+def test_other_maps_are_refused():
+    sized = Calibration(fx=1, fy=1, cx0=0, cy=0, baseline_m=1, width=4, height=3)
+    assert sized.points(np.ones((3, 4))).shape == (3, 4, 3)
+    with pytest.raises(InputError, match="4x3 pixels, got a map of 2x3"):
+        sized.disparity_to_depth(np.ones((3, 2)))
+    for bad in (np.ones(3), np.ones((2, 2), int)):
+        with pytest.raises(InputError, match="disparity must be"):
+            SIMPLE.points(bad)
+
+
+def test_middlebury(tmp_path):
+    path = tmp_path / "calib.txt"
+    path.write_text(MIDDLEBURY)
+    calibration = read_calibration(path)
+    assert calibration.fx == calibration.fy == 999.421
+    assert (calibration.cx0, calibration.cy, calibration.width, calibration.height) == (
+        294.182,
+        252.932,
+        741,
+        497,
+    )
+    assert calibration.baseline_m == pytest.approx(0.193001)
+    assert calibration.doffs == pytest.approx(32.778)
+    path.write_text(MIDDLEBURY.replace("doffs=32.778\n", ""))
+    assert read_calibration(path).doffs == pytest.approx(326.96 - 294.182)
+
+
+def test_kitti(tmp_path):
+    path = tmp_path / "calib_cam_to_cam.txt"
+    path.write_text(KITTI)
+    color = read_calibration(path)
+    assert (color.fx, color.cx0, color.cy, color.doffs) == (721.5377, 609.5593, 172.854, 0)
+    assert (color.width, color.height) == (1242, 375)
+    assert color.baseline_m == pytest.approx((44.85728 + 339.5242) / 721.5377)  # 0.5327 m
+    grey = read_calibration(path, cameras=(0, 1))
+    assert grey.baseline_m == pytest.approx(387.5744 / 721.5377)  # 0.5372 m
+    assert grey.width is None
+    path.write_text(
+        "".join(line.replace("P_rect_0", "P") + "\n" for line in KITTI.splitlines() if line[0] == "P")
+    )
+    assert read_calibration(path).baseline_m == color.baseline_m
+    with pytest.raises(FileError, match="to the right"):
+        read_calibration(path, cameras=(1, 0))
+
+
+def test_json(tmp_path):
+    path = tmp_path / "calibration.json"
+    fields = {"fx": 100, "fy": 50, "cx0": 2, "cy": 1.0, "baseline_m": 0.5}
+    path.write_text(json.dumps(fields))
+    assert read_calibration(path) == SIMPLE
+    path.write_text(json.dumps({**fields, "cx1": 7, "width": 4}))
+    assert read_calibration(path).doffs == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MIDDLEBURY.replace("baseline", "basis"), "no field 'baseline'"),
+        (MIDDLEBURY.replace("cam0", "camera"), "no field 'cam0'"),
+        ("cam0=[1 0 1; 0 1 1; 0 0 1]\nbaseline=3\n", "no field 'doffs'"),
+        (MIDDLEBURY.replace("999.421 0 294.182", "999.421 0"), "cam0 must hold 9 numbers, got 8"),
+        (MIDDLEBURY.replace("193.001", "wide"), "baseline must hold 1 numbers, got 'wide'"),
+        (MIDDLEBURY.replace("741", "inf"), "infinity"),
+        (MIDDLEBURY.replace("193.001", "-1"), "baseline_m must be positive"),
+        (KITTI.replace("P_rect_03", "P_rect_04"), "no field 'P_rect_03'"),
+        ("P0: 1 2 3\n", "no field 'P2'"),
+        ("P2: 1 2 3\nP3: 1 2 3\n", "P2 must hold 12 numbers, got 3"),
+        ('{"fx": 1, "fy": 1, "cx0": 1, "cy": 1}', "no field 'baseline_m'"),
+        ('{"fx": 1, "focal": 1}', "unknown field 'focal'"),
+        ('{"fx": "1"}', "fx must be a number"),
+        ('{"fx": 1,', "not valid JSON"),
+        ("hello\n", "no calibration known here"),
+        ("", "no calibration known here"),
+    ],
+)
+def test_errors_name_the_file_and_the_field(tmp_path, text, message):
+    path = tmp_path / "calib.txt"
+    path.write_text(text)
+    with pytest.raises(FileError, match=message) as caught:
+        read_calibration(path)
+    assert "calib.txt" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(FileError, match="no such file"):
+        read_calibration(tmp_path / "missing.txt")
+    with pytest.raises(FileError, match="cannot read"):
+        read_calibration(tmp_path)
+    (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FileError, match="not a text file"):
+        read_calibration(tmp_path / "a.txt")
+
+
+@pytest.mark.data
+def test_real_calibration():
+    path = DATA / "middlebury/2014/Motorcycle/calib.txt"
+    if not path.is_file():
+        pytest.skip(f"no real pairs in {DATA}; set STEREOKIT_DATA")
+    calibration = read_calibration(path)
+    assert calibration.doffs == pytest.approx(32.778)
+    near, far = (
+        calibration.disparity_to_depth(np.full((497, 741), 65.0))[0, 0],
+        193.001 * 999.421 / (7 + 32.778) / 1e3,
+    )
+    assert near == pytest.approx(1.9727, abs=1e-3)
+    assert far == pytest.approx(4.849, abs=1e-3)

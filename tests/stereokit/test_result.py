@@ -1,0 +1,107 @@
+"""The result of a match: what it checks, its colours and what it passes on."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stereokit.calibration import Calibration
+from stereokit.errors import FileError, InputError, OptionError
+from stereokit.io import read_disparity
+from stereokit.result import Disparity, colorize
+
+NAN = np.nan
+MAP = np.array([[10, 20, NAN], [40, 5, 1]], np.float32)
+VALID = np.array([[1, 1, 0], [1, 0, 0]], bool)
+
+
+def test_a_result_keeps_its_arrays_and_counts_measured_pixels():
+    result = Disparity(MAP, VALID, np.ones((2, 3), np.float32), MAP)
+    assert result.disparity is MAP
+    assert result.density == 0.5
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        result.disparity = MAP
+    assert Disparity(MAP, VALID).confidence is None
+    assert Disparity(MAP, VALID).right is None
+
+
+@pytest.mark.parametrize(
+    ("field", "array", "message"),
+    [
+        ("disparity", MAP.astype(np.float64), "disparity must be float32, got float64"),
+        ("disparity", MAP[0], "disparity must be"),
+        ("disparity", MAP[:0], "disparity must be"),
+        ("disparity", MAP.tolist(), "disparity must be a numpy array, got list"),
+        ("valid", VALID.astype(np.uint8), "valid must be bool, got uint8"),
+        ("valid", VALID[:1], "valid must have the shape"),
+        ("confidence", MAP[:1], "confidence must have the shape"),
+        ("right", VALID.astype(np.int16), "right must be float32"),
+    ],
+)
+def test_wrong_arrays_are_named(field, array, message):
+    with pytest.raises(InputError, match=message):
+        Disparity(**{"disparity": MAP, "valid": VALID, field: array})
+
+
+def test_depth_and_points_come_from_the_calibration():
+    result = Disparity(MAP, VALID)
+    calibration = Calibration(fx=100, fy=100, cx0=0, cy=0, baseline_m=0.1)
+    np.testing.assert_allclose(result.depth(calibration), [[1, 0.5, NAN], [0.25, 2, 10]])
+    assert result.points(calibration).shape == (2, 3, 3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pfm", ".npy", ".tiff"])
+def test_save_follows_the_suffix(tmp_path, suffix):
+    Disparity(MAP, VALID).save(tmp_path / f"d{suffix}")
+    np.testing.assert_array_equal(read_disparity(tmp_path / f"d{suffix}"), MAP)
+
+
+def test_save_refuses_other_suffixes(tmp_path):
+    with pytest.raises(FileError, match=r"\.png, \.pfm, \.npy, \.tiff"):
+        Disparity(MAP, VALID).save(tmp_path / "d.gif")
+
+
+def test_turbo_runs_from_blue_to_red_and_invalid_is_black():
+    colors = colorize(np.array([[0, 50, 100, -7, 200, NAN, np.inf]], np.float32), 0, 100)
+    assert colors.shape == (1, 7, 3)
+    assert colors.dtype == np.uint8
+    # Ends of the published table (Mikhailov 2019): 0.18995, 0.07176, 0.23217; 0.4796, 0.01583, 0.01055
+    assert np.abs(colors[0, 0].astype(int) - [48, 18, 59]).max() <= 1
+    assert np.abs(colors[0, 2].astype(int) - [122, 4, 3]).max() <= 1
+    assert colors[0, 1, 1] > 240  # the middle is green
+    np.testing.assert_array_equal(colors[0, 3], colors[0, 0])
+    np.testing.assert_array_equal(colors[0, 4], colors[0, 2])
+    assert (colors[0, 5:] == 0).all()
+
+
+def test_the_automatic_range_ignores_the_last_percent():
+    disparity = np.arange(1000, dtype=np.float32).reshape(20, 50)
+    disparity[-1, -1] = 1e6
+    np.testing.assert_array_equal(
+        colorize(disparity), colorize(disparity, 0, float(np.percentile(disparity, 99)))
+    )
+    result = Disparity(disparity, np.ones_like(disparity, bool))
+    np.testing.assert_array_equal(result.color(), colorize(disparity))
+    np.testing.assert_array_equal(result.color(min=10, max=30), colorize(disparity, 10, 30))
+
+
+@pytest.mark.parametrize("value", [NAN, 0, -5, 3])
+def test_flat_and_empty_maps_have_colours(value):
+    assert colorize(np.full((2, 3), value, np.float32)).shape == (2, 3, 3)
+
+
+def test_bad_ranges_and_maps_are_refused():
+    for low, high in ((5, 5), (5, 1), (NAN, 1), (0, np.inf)):
+        with pytest.raises(OptionError, match="above low"):
+            colorize(MAP, low, high)
+    with pytest.raises(InputError, match="disparity must be"):
+        colorize(np.ones((2, 2), int))
+
+
+def test_inputs_stay_as_they_are():
+    strided = np.tile(MAP, (2, 2))[::2, ::-1]
+    kept = strided.copy()
+    colorize(strided)
+    np.testing.assert_array_equal(strided, kept)

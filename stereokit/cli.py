@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 _GROUP = "stereokit.commands"
-_OWN_OPTIONS = frozenset(
-    "method max_disparity min_disparity scale refiner fill threads device right".split()  # not through --set
+_OWN_OPTIONS = frozenset(  # not through --set
+    "method max_disparity min_disparity scale refiner fill threads device right confidence".split()
 )
 _STAGES = {
     "census": "Census 9x7 cost",
@@ -116,7 +116,7 @@ def _root(
 
 @app.command()
 def match(
-    left: Annotated[Path, typer.Argument(help="Left image of a rectified pair.")],
+    left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a rectified pair.")],
     right_image: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
     output: Annotated[
         Path,
@@ -127,7 +127,7 @@ def match(
     min_disparity: Annotated[int, typer.Option(help="Disparities searched start here, pixels.")] = 0,
     scale: Annotated[float, typer.Option(help="Match at this size, such as 0.5.")] = 1.0,
     refiner: Annotated[str | None, typer.Option(help="Brings a scaled map to full size; see list.")] = None,
-    fill: Annotated[str, typer.Option(help="Of invalid pixels: nearest, background, none.")] = "background",
+    fill: Annotated[str | None, typer.Option(help="Of invalid pixels: nearest, background, none.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     settings: Annotated[
@@ -149,11 +149,13 @@ def match(
 
     Everything is checked before matching starts. The first run on a machine also compiles, once.
     """
+    import numpy as np
+
     from stereokit import io
 
     suffixes = {
         "--output": (*io.DISPARITY_SUFFIXES, ".tif"),
-        "--color": io.IMAGE_SUFFIXES,
+        "--color": (".png", ".jpg", ".jpeg", ".tiff", ".tif", ".bmp", ".ppm"),
         "--right": (*io.DISPARITY_SUFFIXES, ".tif"),
         "--confidence": (".npy", ".png"),
         "--ply": (".ply",),
@@ -169,8 +171,8 @@ def match(
     if (ply is None) != (calibration is None):
         raise OptionError("--ply and --calibration go together, got only one of them")
     options = _parse_settings(settings or [])
-    if right is not None:
-        options["right"] = True
+    wanted = {"fill": fill, "right": right and True, "confidence": confidence and True}
+    options.update({name: value for name, value in wanted.items() if value is not None})
 
     from stereokit.matching import Matcher
 
@@ -180,7 +182,6 @@ def match(
         min_disparity=min_disparity,
         scale=scale,
         refiner=refiner,
-        fill=None if fill.lower() == "none" else fill,
         threads=threads,
         device=device,
         **options,
@@ -193,6 +194,8 @@ def match(
     camera = _read_camera(calibration, cameras, width, height)
 
     with _waiting("Matching (the first run also compiles) ..."):
+        small = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
+        matcher(*small)  # compiles, so that the time below is that of matching
         start = time.perf_counter()
         result = matcher(*images)
         seconds = time.perf_counter() - start
@@ -216,9 +219,8 @@ def match(
         "max_disparity": matcher.max_disparity,
         "min_disparity": matcher.min_disparity,
         "scale": matcher.scale,
-        "refiner": refiner,
-        "fill": fill.lower(),
-        "device": str(matcher.device),
+        "refiner": matcher.refiner,
+        "device": matcher.device,
         "options": options,
         "density": result.density,
         "seconds": seconds,
@@ -319,6 +321,10 @@ def _fail(message: str, error: BaseException) -> None:
 
 
 def _version(package: str) -> str | None:
+    if package == "stereokit":
+        from stereokit import __version__
+
+        return __version__
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -362,13 +368,14 @@ def _parse_settings(settings: list[str]) -> dict[str, Any]:
     return options
 
 
-def _parse_value(text: str) -> int | float | bool | str:
+def _parse_value(text: str) -> int | float | bool | str | None:
     for kind in (int, float):
         try:
             return kind(text)
         except ValueError:
             pass
-    return {"true": True, "false": False}.get(text.lower(), text)
+    words = {"true": True, "false": False, "none": None}
+    return words[text.lower()] if text.lower() in words else text
 
 
 def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height: int) -> Calibration | None:

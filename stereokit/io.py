@@ -148,7 +148,7 @@ def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:
     path : path
         Ends in one of `IMAGE_SUFFIXES`.
     array : (H, W) or (H, W, 3) uint8, uint16, float32 or float64
-        Grey or RGB. uint16 goes to PNG, TIFF, PGM and PPM, floats to TIFF only.
+        Grey or RGB. uint16 goes to PNG, TIFF, PGM and PPM, floats to TIFF only; PGM is grey, PPM is colour.
 
     Raises
     ------
@@ -166,6 +166,10 @@ def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:
         raise InputError(f"array must be uint8, uint16, float32 or float64, got {kind}")
     if suffix not in _DEEP.get(kind, IMAGE_SUFFIXES):
         raise InputError(f"array of {kind} cannot be kept in {suffix}; use one of {', '.join(_DEEP[kind])}")
+    if (suffix, image.ndim) in ((".pgm", 3), (".ppm", 2)):
+        raise InputError(
+            f"array for {suffix} must be {'(H, W)' if image.ndim == 3 else '(H, W, 3)'}, got {image.shape}"
+        )
     write_bytes(target, _encode(suffix, image))
 
 
@@ -394,8 +398,10 @@ def _decode(path: str | os.PathLike[str]) -> NDArray[Any]:
 
 def _encode(suffix: str, image: NDArray[Any]) -> bytes:
     stored = image if image.ndim == 2 else image[:, :, ::-1]  # OpenCV wants BGR
+    # Left to itself, OpenCV 4 keeps float colour in TIFF as LogLuv, which loses digits; 5 is LZW.
+    settings = [cv2.IMWRITE_TIFF_COMPRESSION, 5] if suffix.startswith(".tif") else []
     try:
-        ok, data = cv2.imencode(suffix, np.ascontiguousarray(stored))
+        ok, data = cv2.imencode(suffix, np.ascontiguousarray(stored), settings)
     except cv2.error as error:
         raise FileError(f"cannot encode {_describe(image)} as {suffix}") from error
     if not ok:

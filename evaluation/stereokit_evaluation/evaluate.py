@@ -19,6 +19,7 @@ from typing import Annotated, Any
 
 import typer
 from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -90,7 +91,8 @@ def evaluate(
     options: dict[str, Any]
     if predictions is not None:
         given = {"method": method, "refiner": refiner, "set": settings, "threads": threads}
-        for name in (name for name, value in given.items() if value):
+        given |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
+        for name in (name for name, value in given.items() if value is not None and value != []):
             raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")
         options = {"predictions": str(predictions)}
         runs = [_Run(from_files(predictions), "predictions")]
@@ -230,9 +232,9 @@ def _draws(folder: Path) -> Callable[..., None]:
 
 
 def _print_table(title: str, runs: Sequence[_Run], results: Sequence[Result]) -> None:
-    table = Table(title=title)
+    table = Table(title=title, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column("method", no_wrap=True)
-    heads = ("images", "D1 noc", "bg", "fg", "D1 occ", "bad-2", "EPE", "density", "ms/image")
+    heads = ("images", "D1 noc", "bg", "fg", "D1 occ", "bad-2", "EPE", "density", "ms")
     for head in heads:
         table.add_column(head, justify="right")
     for job, result in zip(runs, results, strict=False):

@@ -119,6 +119,7 @@ class Dt:
         """
         height, width = guide.shape
         padded = levels.padded
+        blocks = tuple(range(padded // LANES))
         dtype = self.total_dtype if volume is None else np.dtype(np.float32)
         if volume is None:
             costs = workspace.array("dt.volume", height * width * padded, dtype)
@@ -136,9 +137,9 @@ class Dt:
             def filter_rows(k: int, y0: int, y1: int, weights: Weights = weights, number: int = number) -> None:
                 if number == 0 and volume is None:
                     cost = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
-                    _produce_rows(rows[k], padded, guide, weights, y0, y1, cost, costs)
+                    _produce_rows(rows[k], blocks, guide, weights, y0, y1, cost, costs)
                 else:
-                    _filter_rows(padded, guide, weights, y0, y1, costs)
+                    _filter_rows(blocks, guide, weights, y0, y1, costs)
 
             def filter_bands(
                 k: int, part: list[tuple[int, int]], weights: Weights = weights, last: bool = last
@@ -147,7 +148,7 @@ class Dt:
                 state = workspace.array(f"dt.state{k}", band * padded, dtype)
                 for x0, x1 in part:
                     _filter_band(
-                        padded, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep
+                        blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep
                     )
 
             parts = spans(height, min(threads, len(rows)))
@@ -184,83 +185,86 @@ def _jump(guide: NDArray[np.uint8], y: int, x: int, y2: int, x2: int) -> int:
 
 
 @inline
-def _filter_row(padded: int, guide: NDArray[np.uint8], weights: Weights, y: int, base: int, row: NDArray[Any]) -> None:
+def _filter_row(
+    blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, y: int, base: int, row: NDArray[Any]
+) -> None:
     """Forward, then backward along one row of levels at ``row[base:]``, in place."""
     width = guide.shape[1]
+    padded = LANES * len(blocks)
     keep = splat(weights.keep[0])
     for x in range(1, width):
         weight = splat(weights.row[_jump(guide, y, x, y, x - 1)])
         at = base + x * padded
-        for block in range(0, padded, LANES):
-            value = _feed_back(load(row, at + block), load(row, at - padded + block), weight, keep)
-            store(row, at + block, value)
+        for n in range(len(blocks)):
+            to = at + n * LANES
+            store(row, to, _feed_back(load(row, to), load(row, to - padded), weight, keep))
     for back in range(1, width):
         x = width - 1 - back
         weight = splat(weights.row[_jump(guide, y, x + 1, y, x)])
         at = base + x * padded
-        for block in range(0, padded, LANES):
-            value = _feed_back(load(row, at + block), load(row, at + padded + block), weight, keep)
-            store(row, at + block, value)
+        for n in range(len(blocks)):
+            to = at + n * LANES
+            store(row, to, _feed_back(load(row, to), load(row, to + padded), weight, keep))
 
 
 @kernel
 def _produce_rows(
-    rows: Any, padded: int, guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int,
+    rows: Any, blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int,
     cost: NDArray[np.uint8], costs: NDArray[Any],
 ) -> None:  # fmt: skip
     """Costs of rows y0..y1, filtered along the row, into the volume."""
-    width = guide.shape[1]
+    size = guide.shape[1] * LANES * len(blocks)
     like = costs[0]
     unit = splat(costs.dtype.type(_FRACTION if costs.itemsize == 2 else 1))
     for y in range(y0, y1):
         cost_row(rows, y, cost)
-        base = y * width * padded
-        for at in range(0, width * padded, LANES):
-            store(costs, base + at, multiply(convert(load(cost, at), like), unit))
-        _filter_row(padded, guide, weights, y, base, costs)
+        for at in range(0, size, LANES):
+            store(costs, y * size + at, multiply(convert(load(cost, at), like), unit))
+        _filter_row(blocks, guide, weights, y, y * size, costs)
 
 
 @kernel
 def _filter_rows(
-    padded: int, guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int, costs: NDArray[Any]
+    blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int, costs: NDArray[Any]
 ) -> None:
+    size = guide.shape[1] * LANES * len(blocks)
     for y in range(y0, y1):
-        _filter_row(padded, guide, weights, y, y * guide.shape[1] * padded, costs)
+        _filter_row(blocks, guide, weights, y, y * size, costs)
 
 
 @kernel
 def _filter_band(
-    padded: int, guide: NDArray[np.uint8], weights: Weights, x0: int, x1: int, costs: NDArray[Any],
+    blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, x0: int, x1: int, costs: NDArray[Any],
     column: NDArray[Any], state: NDArray[Any], keys: NDArray[Any], last: bool, out: Winners,
     total: NDArray[Any],
 ) -> None:  # fmt: skip
     """Down, then up the columns x0..x1; select on the way up of the last pass, else write the costs back."""
     height, width = guide.shape
+    padded = LANES * len(blocks)
     size = (x1 - x0) * padded
     keep = splat(weights.keep[0])
+    none = costs.dtype.type(0)
+    state[:] = none
     for y in range(height):
         base = (y * width + x0) * padded
         for x in range(x0, x1):
-            weight = splat(weights.column[_jump(guide, y, x, max(y - 1, 0), x)])
-            for at in range((x - x0) * padded, (x - x0 + 1) * padded, LANES):
-                value = load(costs, base + at)
-                if y > 0:
-                    value = _feed_back(value, load(state, at), weight, keep)
+            weight = splat(weights.column[_jump(guide, y, x, y - 1, x)] if y > 0 else none)
+            for n in range(len(blocks)):
+                at = (x - x0) * padded + n * LANES
+                value = _feed_back(load(costs, base + at), load(state, at), weight, keep)
                 store(state, at, value)
                 store(column, y * size + at, value)
     for back in range(height):
         y = height - 1 - back
         base = (y * width + x0) * padded
         for x in range(x0, x1):
-            weight = splat(weights.column[_jump(guide, min(y + 1, height - 1), x, y, x)])
-            for at in range((x - x0) * padded, (x - x0 + 1) * padded, LANES):
-                value = load(column, y * size + at)
-                if back > 0:
-                    value = _feed_back(value, load(state, at), weight, keep)
-                store(state, at, value)
-                if not last:
-                    store(costs, base + at, value)
-                elif total.size > 0:
-                    store(total, base + at, value)
+            weight = splat(weights.column[_jump(guide, y + 1, x, y, x)] if back > 0 else none)
+            for n in range(len(blocks)):
+                at = (x - x0) * padded + n * LANES
+                store(state, at, _feed_back(load(column, y * size + at), load(state, at), weight, keep))
             if last:
                 select_pixel(keys, state, (x - x0) * padded, padded, y * width + x, out)
+        if not last:
+            costs[base : base + size] = state[:size]
+        elif total.size > 0:
+            total[base : base + size] = state[:size]

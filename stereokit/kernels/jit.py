@@ -5,11 +5,17 @@ interpreter lock so that plain threads run it side by side, and divides as numpy
 exception inside loops). There is no ``fastmath``: results must not depend on the processor. There is no
 ``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.pool` runs
 several of them at once, which is safe from any number of calling threads and compiles in half the time.
+
+Numba files a compiled kernel under the name of its function and looks only at the file which that stands in, not
+at the functions that are compiled into it. So each name carries a fingerprint of the whole package's source: after
+an upgrade, or an edit anywhere, nothing stale is ever loaded.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
@@ -19,8 +25,19 @@ __all__ = ["inline", "kernel"]
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+def _fingerprint() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+_FINGERPRINT = _fingerprint()
+
+
 def kernel(function: F) -> F:
     """Compile `function` as a kernel that Python code calls."""
+    function.__qualname__ = f"{function.__qualname__}_{_FINGERPRINT}"
     compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     return compiled
 

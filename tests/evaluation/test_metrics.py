@@ -1,4 +1,4 @@
-"""The KITTI evaluation against loops written from the development kit, and against numbers worked out by hand."""
+"""The KITTI evaluation against loops written from the development kit, and numbers worked out by hand."""
 
 from __future__ import annotations
 
@@ -169,13 +169,14 @@ def test_d1_by_hand():
     assert result.all.filled.d1() == 100 * 4 / 7
 
 
-@pytest.mark.parametrize(("truth", "error", "bad"), [(60.0, 3.0, False), (20.0, 3.0, False), (10.0, 3.0, False)])
-def test_three_pixels_are_no_error(truth, error, bad):
-    assert outliers(np.float32([error]), np.float32([truth]))[0] == bad
+def test_three_pixels_are_no_error():
+    truth = np.float32([10, 20, 59])
+    assert not outliers(np.full(3, 3, np.float32), truth).any()
+    assert outliers(np.full(3, np.nextafter(np.float32(3), np.float32(4))), truth).all()
 
 
 def test_five_percent_rounds_up_to_an_error():
-    # The kit compiled with g++ on x86-64 calls all 2163 of these errors: 1/20 as a float is above the double 0.05.
+    # The kit, compiled by g++ for x86-64, calls all of these errors: 1/20 as a float exceeds the double 0.05.
     truth = np.arange(61 * 256 // 20 * 20 + 20, 230 * 256, 20, dtype=np.float32) / np.float32(256)
     error = truth / np.float32(20)
     assert error.min() > 3
@@ -305,7 +306,9 @@ def test_authors_coarse_maps_score_as_the_loop_does():
             kind: cv2.imread(str(truth_folder / f"disp_{kind}_0" / name), cv2.IMREAD_UNCHANGED)
             for kind in ("noc", "occ")
         }
-        truth = {kind: np.where(raw == 0, np.float32(NAN), raw / np.float32(256)) for kind, raw in stored.items()}
+        truth = {
+            kind: np.where(raw == 0, np.float32(NAN), raw / np.float32(256)) for kind, raw in stored.items()
+        }
         coarse = cv2.imread(str(DATA / "authors_coarse" / "disp" / name), cv2.IMREAD_UNCHANGED)
         height, width = stored["noc"].shape
         estimate = cv2.resize(coarse.astype(np.float32) / 256, (width, height)) * np.float32(2)
@@ -315,5 +318,7 @@ def test_authors_coarse_maps_score_as_the_loop_does():
             loop[kind] = [a + b for a, b in zip(loop[kind], counted, strict=True)]
     assert as_lists(total.noc)["all"] == loop["noc"]
     assert as_lists(total.occ)["all"] == loop["occ"]
-    # From the loop above; the maps are dense, so nothing is filled.
-    print(loop, total.noc.all.filled.d1(), total.occ.all.filled.d1())
+    # The loop gave, with OpenCV 5.0.0, 46547 of 387316 and 48780 of 391238; another resize may move a few.
+    assert total.noc.all.filled.d1() == pytest.approx(12.0178, abs=0.005)
+    assert total.occ.all.filled.d1() == pytest.approx(12.4681, abs=0.005)
+    assert (total.noc.all.density(), total.occ.all.density()) == (100.0, 100.0)  # the maps are dense

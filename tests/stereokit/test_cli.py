@@ -35,6 +35,7 @@ class FakeMatcher:
         FakeMatcher.made.append({"method": method, **options})
         self.method = {"S2": "census+sgm"}.get(method, method)
         self.max_disparity, self.min_disparity = options["max_disparity"], options["min_disparity"]
+        self.refiner = options["refiner"]
         self.scale, self.device, self.with_right = options["scale"], "cpu", options.get("right", False)
 
     def __call__(self, left, right):
@@ -71,7 +72,11 @@ def pair(tmp_path):
 
 
 def run(*arguments):
-    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+    try:
+        runner = CliRunner(mix_stderr=False)  # typer before 0.15 mixes them by default
+    except TypeError:
+        runner = CliRunner()
+    return runner.invoke(cli.app, [str(argument) for argument in arguments])
 
 
 def error_of(result):
@@ -117,7 +122,6 @@ def test_match_writes_the_map(tmp_path, pair, suffix):
             "min_disparity": 0,
             "scale": 1.0,
             "refiner": None,
-            "fill": "background",
             "threads": None,
             "device": "auto",
         }
@@ -128,7 +132,18 @@ def test_match_passes_every_option(tmp_path, pair):
     result = run(
         *("match", *pair, "-o", tmp_path / "d.npy", "-m", "S2", "--max-disparity", 64, "--min-disparity", -4),
         *("--scale", 0.5, "--refiner", "linear", "--fill", "none", "--threads", 1, "--device", "cpu"),
-        *("--set", "p1=10", "--set", "sigma-s = 2.5", "--set", "subpixel=False", "--set", "mode=rf"),
+        *(
+            "--set",
+            "p1=10",
+            "--set",
+            "sigma-s = 2.5",
+            "--set",
+            "subpixel=False",
+            "--set",
+            "mode=rf",
+            "--set",
+            "outside=None",
+        ),
     )
     assert result.exit_code == 0, result.output
     assert FakeMatcher.made == [
@@ -138,13 +153,14 @@ def test_match_passes_every_option(tmp_path, pair):
             "min_disparity": -4,
             "scale": 0.5,
             "refiner": "linear",
-            "fill": None,
+            "fill": "none",
             "threads": 1,
             "device": "cpu",
             "p1": 10,
             "sigma_s": 2.5,
             "subpixel": False,
             "mode": "rf",
+            "outside": None,
         }
     ]
 
@@ -156,6 +172,8 @@ def test_match_writes_everything_else(tmp_path, pair):
         "match", *pair, "-o", tmp_path / "d.png", *options, "--calibration", tmp_path / "calibration.json"
     )
     assert result.exit_code == 0, result.output
+    assert FakeMatcher.made[0]["right"] is True
+    assert FakeMatcher.made[0]["confidence"] is True
     color = io.read_image(tmp_path / "c.png")
     assert color.shape == (HEIGHT, WIDTH, 3)
     assert (color[:, 0] == 0).all()
@@ -311,7 +329,7 @@ def test_info(tmp_path):
 
 
 def test_version(monkeypatch):
-    monkeypatch.setattr(metadata, "version", lambda name: "1.2.3")
+    monkeypatch.setattr("stereokit.__version__", "1.2.3")
     result = run("--version")
     assert result.exit_code == 0
     assert result.stdout == "stereokit 1.2.3\n"

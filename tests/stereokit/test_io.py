@@ -113,6 +113,14 @@ def test_write_image_refuses_other_arrays(tmp_path, array):
     assert not any(tmp_path.iterdir())
 
 
+def test_pgm_is_grey_and_ppm_is_colour(tmp_path):
+    with pytest.raises(InputError, match=r"\.pgm must be \(H, W\), got \(2, 2, 3\)"):
+        io.write_image(tmp_path / "a.pgm", np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(InputError, match=r"\.ppm must be \(H, W, 3\), got \(2, 2\)"):
+        io.write_image(tmp_path / "a.ppm", np.zeros((2, 2), np.uint8))
+    assert not any(tmp_path.iterdir())
+
+
 def test_kitti_png_is_read_as_the_devkit_says(tmp_path):
     png(
         tmp_path / "d.png",
@@ -246,6 +254,14 @@ def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch
         io.write_disparity(path, np.zeros((3, 3), np.float32))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", io.IMAGE_SUFFIXES)
+def test_writing_prints_nothing(tmp_path, capfd, suffix):
+    shape = (4, 4, 3) if suffix == ".ppm" else (4, 4)
+    io.write_image(tmp_path / f"a{suffix}", np.zeros(shape, np.uint8))
+    io.read_image(tmp_path / f"a{suffix}")
+    assert capfd.readouterr() == ("", "")
 
 
 def test_written_files_have_ordinary_rights(tmp_path):

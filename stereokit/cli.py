@@ -73,7 +73,7 @@ class _Commands(TyperGroup):
             if (error.name or "stereokit").startswith("stereokit"):
                 raise
             _fail(f"this needs the package {error.name!r}, which is not installed", error)
-        except KeyboardInterrupt as error:
+        except KeyboardInterrupt as error:  # typer 0.12 would end with 1
             raise typer.Exit(130) from error
 
 

@@ -12,11 +12,12 @@ METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+s
 DEFAULTS: dict[str, dict[str, Any]] = {
     "": {
         "confidence": False,
-        "fill": "background",
-        "median": 3,
-        "outside": 0.5,
+        "fill": "nearest",
+        "median": 5,
+        "outside": 0.3,
         "right": False,
         "smp": True,
+        "speckle": 0.0005,
         "subpixel": True,
     },
 }

@@ -26,6 +26,7 @@ from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.fill import FILLS, fill
 from stereokit.postprocess.median import median
 from stereokit.postprocess.smp import single_matching_phase
+from stereokit.postprocess.speckle import remove_speckles
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
 from stereokit.selection.wta import winners_like
@@ -33,7 +34,7 @@ from stereokit.selection.wta import winners_like
 __all__ = ["METHODS", "Matcher", "match", "parse_method", "warmup"]
 
 _MAX_LEVELS = 2048
-_PIPELINE = ("confidence", "fill", "median", "outside", "right", "smp", "subpixel")
+_PIPELINE = ("confidence", "fill", "median", "outside", "right", "smp", "speckle", "subpixel")
 
 
 def parse_method(method: str) -> str:
@@ -99,7 +100,8 @@ class Matcher:
     **options
         Options of the stages by name: those of the cost and of the aggregation (see `stereokit.costs.Census`,
         `Zncc`, `stereokit.aggregation.Sgm`, `Dt`), ``subpixel``, and of the pipeline: ``smp`` (bool, single
-        matching phase), ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of
+        matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the image),
+        ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of
         the cost's range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the
         right view's map too; twice the time). Defaults are those of `stereokit.defaults`.
 
@@ -164,6 +166,7 @@ class Matcher:
         self.median = int(merged["median"])
         outside = merged["outside"]
         self.outside = None if outside is None else check_number("outside", outside, 0, 1)
+        self.speckle = check_number("speckle", merged["speckle"], 0, 1)
         self.smp = check_flag("smp", merged["smp"])
         self.subpixel = check_flag("subpixel", merged["subpixel"])
         self.confidence = check_flag("confidence", merged["confidence"])
@@ -226,6 +229,8 @@ class Matcher:
             disparity[pair.left_bad] = np.nan
         if self.smp:
             disparity = single_matching_phase(disparity, cost, threads=self.threads)
+        if self.speckle:
+            disparity = remove_speckles(disparity, int(self.speckle * disparity.size))
         valid = ~np.isnan(disparity)
         if self.fill is not None:
             disparity = fill(disparity, self.fill, threads=self.threads)

@@ -9,7 +9,8 @@ pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ __all__ = [
 _KITTI_DISPARITIES = 128  # the study's D; a few pixels of the ground truth lie beyond
 _LEVELS = {"2001": 8, "2003": 4, "2006": 3}  # levels a pixel in the 8-bit disparity maps
 _WIDEST = {"2001": 1000, "2003": 450, "2006": 480}  # a wider image is of a larger edition, with other levels
+_SCENE_SIZE = (640, 384)  # width, height
 _IMAGES = (".png", ".ppm", ".pgm", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _MAPS = (".png", ".pfm", ".npy")
 
@@ -128,7 +130,24 @@ def scenes(count: int = 20) -> list[Frame]:
     """
     if count < 1:
         raise OptionError(f"count must be at least 1, got {count}")
-    return []  # TODO
+
+    def part(index: int, take: Callable[[Any], NDArray[Any]]) -> Loader:
+        return lambda: take(_scene(index))
+
+    def seen(scene: Any) -> NDArray[np.float32]:
+        disparity: NDArray[np.float32] = np.where(scene.occluded, np.float32(np.nan), scene.disparity)
+        return disparity
+
+    return [
+        Frame(
+            f"scene_{index:03d}",
+            part(index, lambda scene: scene.left),
+            part(index, lambda scene: scene.right),
+            noc=part(index, seen),
+            occ=part(index, lambda scene: scene.disparity),
+        )
+        for index in range(count)
+    ]
 
 
 DATASETS: dict[str, Callable[[str | Path], list[Frame]]] = {
@@ -165,6 +184,12 @@ def load(dataset: str, root: str | Path | None = None, *, count: int = 20) -> li
     if root is None:
         raise OptionError(f"root must name the folder of data set {dataset!r}, got none")
     return DATASETS[dataset](root)
+
+
+@lru_cache(maxsize=2)
+def _scene(index: int) -> Any:
+    """Draw a scene once for its images and maps, which are asked for one after the other."""
+    return import_module("stereokit_evaluation.scenes").generate(index, *_SCENE_SIZE)
 
 
 def _kitti(

@@ -90,7 +90,7 @@ def evaluate(
     chosen = select(load(dataset, root, count=count), frames)
     options: dict[str, Any]
     if predictions is not None:
-        given = {"method": method, "refiner": refiner, "set": settings, "threads": threads}
+        given: dict[str, Any] = {"method": method, "refiner": refiner, "set": settings, "threads": threads}
         given |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
         for name in (name for name, value in given.items() if value is not None and value != []):
             raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")

@@ -15,9 +15,11 @@ Rows are filtered as the cost produces them and written to the one volume; then 
 down and up, and the upward sweep selects as it goes. Rows and bands are independent of one another, so any number
 of threads gives the same result.
 
-``rf`` runs in 16-bit fixed point, costs with 7 fractional bits and weights with 15: half the memory of floats and
-the same result on every processor. The rounding stays far below one unit of cost. ``sum`` grows without bound and
-runs in float32. `stereokit.aggregate` takes float volumes too and filters them in float32.
+``rf`` runs in 16-bit fixed point, costs with 7 fractional bits and weights with 15, and the volume between rows and
+columns holds bytes, costs with as many fractional bits as fit: a quarter of the memory of floats and the same result
+on every processor. The rounding stays below half a unit of cost and was measured to leave the error where it is.
+``sum`` grows without bound and runs in float32. `stereokit.aggregate` takes float volumes too and filters them in
+float32.
 """
 
 from __future__ import annotations
@@ -35,16 +37,25 @@ from stereokit.costs.rows import Cost, Levels, cost_row
 from stereokit.errors import OptionError
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
-from stereokit.kernels.simd import LANES, add, convert, load, multiply, multiply_q15, splat, store, subtract
+from stereokit.kernels.simd import (
+    LANES,
+    add,
+    convert,
+    load,
+    minimum,
+    multiply,
+    multiply_q15,
+    shift_left,
+    shift_right,
+    splat,
+    store,
+    subtract,
+)
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, keys_of, select_pixel
 
 __all__ = ["Dt", "edge_weights"]
-
-_FRACTION = 128
-"""Fixed-point costs: units per unit of cost. Costs reach 255, so 7 bits are what int16 leaves."""
-
 
 class Weights(NamedTuple):
     """Feedback by grey difference of the step, of one pass: (256,) float32, or int16 times 2**15."""
@@ -52,6 +63,11 @@ class Weights(NamedTuple):
     row: NDArray[Any]
     column: NDArray[Any]
     keep: NDArray[Any]  # (1,): 1 for the normalised recursion, 0 for the plain sum
+    shift: int  # fixed point: the volume's bytes hold `_FRACTION_BITS - shift` fractional bits
+
+
+_FRACTION_BITS = 7
+"""Fixed-point costs: fractional bits while a row or column is filtered. Costs reach 255: that is what int16 leaves."""
 
 
 @AGGREGATIONS.register("dt")
@@ -62,7 +78,10 @@ class Dt:
     Parameters
     ----------
     sigma_s : float
-        Spatial scale in pixels (``rf``).
+        Spatial scale along rows in pixels (``rf``).
+    sigma_v : float or None
+        Spatial scale along columns in pixels (``rf``); None takes `sigma_s`. Surfaces that people drive and walk on
+        change their disparity from row to row, so that less is better.
     sigma_r : float
         Range scale in grey levels of 0..255 (``rf``).
     passes : int
@@ -71,8 +90,9 @@ class Dt:
         Which of the two published forms.
     """
 
-    sigma_s: float = 20.0
-    sigma_r: float = 30.0
+    sigma_s: float = 14.0
+    sigma_v: float | None = 6.0
+    sigma_r: float = 90.0
     passes: int = 1
     mode: str = "rf"
     name: ClassVar[str] = "dt"
@@ -80,8 +100,10 @@ class Dt:
     def __post_init__(self) -> None:
         if self.mode not in ("rf", "sum"):
             raise OptionError(f"mode of dt must be 'rf' or 'sum', got {self.mode!r}")
-        for name in ("sigma_s", "sigma_r"):
+        for name in ("sigma_s", "sigma_v", "sigma_r"):
             value = getattr(self, name)
+            if name == "sigma_v" and value is None:
+                continue
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
                 raise OptionError(f"{name} must be a positive number, got {value!r}")
         if not isinstance(self.passes, int) or not 1 <= self.passes <= 5:
@@ -92,22 +114,30 @@ class Dt:
         """Type of the aggregated costs of ``uint8`` rows."""
         return np.int16 if self.mode == "rf" else np.float32
 
-    def weights(self, dtype: Any) -> list[Weights]:
-        """Return the feedback of each pass."""
+    def weights(self, dtype: Any, cost_max: int) -> list[Weights]:
+        """Return the feedback of each pass for costs up to `cost_max`."""
         if self.mode == "sum":
             row, column = edge_weights()
-            return [Weights(row, column, np.zeros(1, np.float32))]
-        result = []
-        for i in range(1, self.passes + 1):
-            sigma = self.sigma_s * math.sqrt(3) * 2.0 ** (self.passes - i) / math.sqrt(4.0**self.passes - 1)
-            a = math.exp(-math.sqrt(2) / sigma)
-            table = [a ** (1 + self.sigma_s / self.sigma_r * jump) for jump in range(256)]
-            if dtype == np.int16:
-                fixed = np.array([min(round(w * 2**15), 2**15 - 1) for w in table], np.int16)
-            else:
-                fixed = np.array(table, np.float32)
-            result.append(Weights(fixed, fixed, np.ones(1, fixed.dtype)))
-        return result
+            return [Weights(row, column, np.zeros(1, np.float32), 0)]
+        shift = _FRACTION_BITS - (8 - int(cost_max).bit_length())
+        return [
+            Weights(
+                self._table(self.sigma_s, i, dtype),
+                self._table(self.sigma_s if self.sigma_v is None else self.sigma_v, i, dtype),
+                np.ones(1, dtype),
+                shift,
+            )
+            for i in range(1, self.passes + 1)
+        ]
+
+    def _table(self, sigma_s: float, i: int, dtype: Any) -> NDArray[Any]:
+        """Feedback of pass `i` by grey difference: ``a**t`` of equation 21."""
+        sigma = sigma_s * math.sqrt(3) * 2.0 ** (self.passes - i) / math.sqrt(4.0**self.passes - 1)
+        a = math.exp(-math.sqrt(2) / sigma)
+        table = [a ** (1 + sigma_s / self.sigma_r * jump) for jump in range(256)]
+        if dtype == np.int16:
+            return np.array([min(round(w * 2**15), 2**15 - 1) for w in table], np.int16)
+        return np.array(table, np.float32)
 
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
@@ -122,24 +152,26 @@ class Dt:
         blocks = tuple(range(padded // LANES))
         dtype = self.total_dtype if volume is None else np.dtype(np.float32)
         if volume is None:
-            costs = workspace.array("dt.volume", height * width * padded, dtype)
+            stored = np.uint8 if self.mode == "rf" else np.float32
+            costs = workspace.array("dt.volume", height * width * padded, stored)
         else:
             costs = volume.reshape(-1)
         keep = np.empty(0, dtype) if total is None else total.reshape(-1)
-        passes = self.weights(dtype)
+        passes = self.weights(dtype, cost.cost_max)
         # A band is narrow enough for its columns to stay in the caches between the way down and the way up.
-        band = max(1, min(width, 2**20 // max(1, height * padded * costs.itemsize)))
+        band = max(1, min(width, 2**20 // max(1, height * padded * np.dtype(dtype).itemsize)))
         bands = spans(width, -(-width // band))
         band = max(x1 - x0 for x0, x1 in bands)
         for number, weights in enumerate(passes):
             last = number == len(passes) - 1
 
             def filter_rows(k: int, y0: int, y1: int, weights: Weights = weights, number: int = number) -> None:
+                row = workspace.array(f"dt.row{k}", width * padded, dtype)
                 if number == 0 and volume is None:
-                    cost = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
-                    _produce_rows(rows[k], blocks, guide, weights, y0, y1, cost, costs)
+                    fresh = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
+                    _produce_rows(rows[k], blocks, guide, weights, y0, y1, fresh, row, costs)
                 else:
-                    _filter_rows(blocks, guide, weights, y0, y1, costs)
+                    _filter_rows(blocks, guide, weights, y0, y1, row, costs)
 
             def filter_bands(
                 k: int, part: list[tuple[int, int]], weights: Weights = weights, last: bool = last
@@ -179,6 +211,40 @@ def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     )
 
 
+def _unpack(costs: Any, at: int, shift: int, like: Any) -> Any:
+    """64 costs of the volume in the type of `like`; compiled code only."""
+    raise NotImplementedError("compiled code only")
+
+
+@overload(_unpack, strict=False, jit_options={"forceinline": True})
+def _choose_unpack(costs: Any, at: Any, shift: Any, like: Any) -> Any:
+    if costs.dtype == types.uint8:
+        return lambda costs, at, shift, like: shift_left(convert(load(costs, at), like), shift)
+    return lambda costs, at, shift, like: load(costs, at)
+
+
+def _pack(costs: Any, at: int, value: Any, shift: int) -> None:
+    """Put 64 costs into the volume, rounded to what it holds; compiled code only."""
+    raise NotImplementedError("compiled code only")
+
+
+@overload(_pack, strict=False, jit_options={"forceinline": True})
+def _choose_pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
+    if costs.dtype == types.uint8:
+        # Half a step is added before the shift; the largest cost, 255, must not pass the byte.
+        return lambda costs, at, value, shift: store(
+            costs,
+            at,
+            convert(
+                minimum(
+                    shift_right(add(value, splat(np.int16((1 << shift) >> 1))), shift), splat(np.int16(255))
+                ),
+                np.uint8(0),
+            ),
+        )
+    return lambda costs, at, value, shift: store(costs, at, value)
+
+
 @inline
 def _jump(guide: NDArray[np.uint8], y: int, x: int, y2: int, x2: int) -> int:
     return abs(np.int32(guide[y, x]) - np.int32(guide[y2, x2]))
@@ -210,26 +276,34 @@ def _filter_row(
 @kernel
 def _produce_rows(
     rows: Any, blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int,
-    cost: NDArray[np.uint8], costs: NDArray[Any],
+    cost: NDArray[np.uint8], row: NDArray[Any], costs: NDArray[Any],
 ) -> None:  # fmt: skip
     """Costs of rows y0..y1, filtered along the row, into the volume."""
-    size = guide.shape[1] * LANES * len(blocks)
-    like = costs[0]
-    unit = splat(costs.dtype.type(_FRACTION if costs.itemsize == 2 else 1))
+    size = row.size
+    like = row[0]
+    unit = splat(row.dtype.type(1 << _FRACTION_BITS if row.itemsize == 2 else 1))
     for y in range(y0, y1):
         cost_row(rows, y, cost)
         for at in range(0, size, LANES):
-            store(costs, y * size + at, multiply(convert(load(cost, at), like), unit))
-        _filter_row(blocks, guide, weights, y, y * size, costs)
+            store(row, at, multiply(convert(load(cost, at), like), unit))
+        _filter_row(blocks, guide, weights, y, 0, row)
+        for at in range(0, size, LANES):
+            _pack(costs, y * size + at, load(row, at), weights.shift)
 
 
 @kernel
 def _filter_rows(
-    blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int, costs: NDArray[Any]
-) -> None:
-    size = guide.shape[1] * LANES * len(blocks)
+    blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, y0: int, y1: int,
+    row: NDArray[Any], costs: NDArray[Any],
+) -> None:  # fmt: skip
+    size = row.size
+    like = row[0]
     for y in range(y0, y1):
-        _filter_row(blocks, guide, weights, y, y * size, costs)
+        for at in range(0, size, LANES):
+            store(row, at, _unpack(costs, y * size + at, weights.shift, like))
+        _filter_row(blocks, guide, weights, y, 0, row)
+        for at in range(0, size, LANES):
+            _pack(costs, y * size + at, load(row, at), weights.shift)
 
 
 @kernel
@@ -243,7 +317,7 @@ def _filter_band(
     padded = LANES * len(blocks)
     size = (x1 - x0) * padded
     keep = splat(weights.keep[0])
-    none = costs.dtype.type(0)
+    none = state.dtype.type(0)
     state[:] = none
     for y in range(height):
         base = (y * width + x0) * padded
@@ -251,7 +325,8 @@ def _filter_band(
             weight = splat(weights.column[_jump(guide, y, x, y - 1, x)] if y > 0 else none)
             for n in range(len(blocks)):
                 at = (x - x0) * padded + n * LANES
-                value = _feed_back(load(costs, base + at), load(state, at), weight, keep)
+                value = _unpack(costs, base + at, weights.shift, none)
+                value = _feed_back(value, load(state, at), weight, keep)
                 store(state, at, value)
                 store(column, y * size + at, value)
     for back in range(height):
@@ -265,6 +340,7 @@ def _filter_band(
             if last:
                 select_pixel(keys, state, (x - x0) * padded, padded, y * width + x, out)
         if not last:
-            costs[base : base + size] = state[:size]
+            for at in range(0, size, LANES):
+                _pack(costs, base + at, load(state, at), weights.shift)
         elif total.size > 0:
             total[base : base + size] = state[:size]

@@ -45,6 +45,8 @@ __all__ = [
     "multiply",
     "multiply_q15",
     "shift_down",
+    "shift_left",
+    "shift_right",
     "shift_up",
     "splat",
     "store",
@@ -265,6 +267,27 @@ def convert(typing: Any, value: Any, like: Any) -> Any:
         return source
 
     return target(value, like), generate
+
+
+def _shift(name: str, doc: str, build: Any) -> Any:
+    def define(typing: Any, value: Any, count: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            amount = builder.trunc(args[1], value.element)
+            return build(builder, value, args[0], _splat_ir(builder, amount, value))
+
+        return value(value, types.intp), generate
+
+    define.__name__ = name
+    define.__doc__ = doc
+    return intrinsic(define)
+
+
+shift_left = _shift("shift_left", "Return value << count.", lambda b, k, x, n: b.shl(x, n))
+shift_right = _shift(
+    "shift_right",
+    "Return value >> count; the sign stays.",
+    lambda b, k, x, n: (b.ashr if k.scalar.signed else b.lshr)(x, n),
+)
 
 
 def _shuffle(name: str, doc: str, lanes: list[int]) -> Any:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -230,6 +232,28 @@ def test_images_from_functions_turn_grey():
     assert frame.load_left(gray=True)[0, 0] == 30  # 0.299 of red
     assert frame.load_left().shape == (2, 3, 3)
     assert frame.load_right(gray=True)[0, 0] == 4
+
+
+def test_scenes_are_adapted_and_drawn_once(monkeypatch):
+    drawn = []
+
+    def generate(index, width, height):
+        drawn.append(index)
+        disparity = np.full((height, width), 5.0 + index, np.float32)
+        occluded = np.zeros((height, width), bool)
+        occluded[:, :5] = True
+        image = np.full((height, width), index, np.uint8)
+        return SimpleNamespace(left=image, right=image + 1, disparity=disparity, occluded=occluded)
+
+    monkeypatch.setitem(sys.modules, "stereokit_evaluation.scenes", SimpleNamespace(generate=generate))
+    datasets._scene.cache_clear()
+    frames = datasets.load("scenes", count=3)
+    assert [frame.name for frame in frames] == ["scene_000", "scene_001", "scene_002"] and not drawn
+    frame = select(frames, "1")[0]
+    assert (frame.load_left()[0, 0], frame.load_right()[0, 0], frame.load_occ()[0, 0]) == (1, 2, 6.0)
+    assert np.isnan(frame.load_noc()[:, :5]).all() and (frame.load_noc()[:, 5:] == 6.0).all()
+    assert drawn == [1]
+    datasets._scene.cache_clear()
 
 
 def test_scenes():

@@ -16,9 +16,13 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "median": 5,
         "outside": 0.3,
         "right": False,
+        "smooth": 0.6,
         "smp": True,
         "speckle": 0.0005,
         "subpixel": True,
+        "uniqueness": 0,
     },
+    "census+sgm": {"p1": 30, "p2": 170},
+    "zncc+sgm": {"p1": 20 / 31, "p2": 120 / 31},
 }
 """Options by method; those under the empty name hold for all methods that do not say otherwise."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, OptionError, did_you_mean
 
-__all__ = ["GrayPair", "check_flag", "check_integer", "check_names", "check_number", "gray_pair", "half_size"]
+__all__ = ["GrayPair", "check_flag", "check_integer", "check_names", "check_number", "gray_pair", "half_size", "smooth"]
 
 _TYPES = (np.uint8, np.uint16, np.float32, np.float64)
 
@@ -165,6 +165,28 @@ def _guide(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint8]:
     high = max(int(left.max()), int(right.max()))
     scaled = (left.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1))
     return np.rint(scaled).astype(np.uint8)
+
+
+def smooth(pair: GrayPair, sigma: float) -> GrayPair:
+    """Return the pair with both images smoothed by a Gaussian; the guide stays as sharp as it was.
+
+    The result is 16 bit, so that nothing is lost to rounding: 8-bit images are multiplied by 256 first.
+
+    Parameters
+    ----------
+    pair : GrayPair
+    sigma : float
+        Standard deviation in pixels; 0 returns the pair itself.
+    """
+    if sigma == 0:
+        return pair
+
+    def blur(image: NDArray[Any]) -> NDArray[np.uint16]:
+        wide = image.astype(np.uint16) << 8 if image.dtype == np.uint8 else image
+        blurred = cv2.GaussianBlur(wide, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(blurred, np.uint16).reshape(image.shape)
+
+    return GrayPair(blur(pair.left), blur(pair.right), pair.left_bad, pair.right_bad, pair.guide)
 
 
 def half_size(pair: GrayPair) -> GrayPair:

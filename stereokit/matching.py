@@ -20,7 +20,7 @@ from stereokit.aggregation import sgm as _sgm  # noqa: F401
 from stereokit.costs.rows import Levels, Pair
 from stereokit.defaults import DEFAULTS, METHODS
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean
-from stereokit.inputs import GrayPair, check_flag, check_integer, check_names, check_number, gray_pair, half_size
+from stereokit.inputs import GrayPair, check_flag, check_integer, check_names, check_number, gray_pair, half_size, smooth
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.fill import FILLS, fill
@@ -34,7 +34,7 @@ from stereokit.selection.wta import winners_like
 __all__ = ["METHODS", "Matcher", "match", "parse_method", "warmup"]
 
 _MAX_LEVELS = 2048
-_PIPELINE = ("confidence", "fill", "median", "outside", "right", "smp", "speckle", "subpixel")
+_PIPELINE = ("confidence", "fill", "median", "outside", "right", "smooth", "smp", "speckle", "subpixel", "uniqueness")
 
 
 def parse_method(method: str) -> str:
@@ -99,7 +99,9 @@ class Matcher:
         How invalid pixels are filled; None (or ``"none"``) leaves them NaN.
     **options
         Options of the stages by name: those of the cost and of the aggregation (see `stereokit.costs.Census`,
-        `Zncc`, `stereokit.aggregation.Sgm`, `Dt`), ``subpixel``, and of the pipeline: ``smp`` (bool, single
+        `Zncc`, `stereokit.aggregation.Sgm`, `Dt`), ``subpixel``, and of the pipeline: ``smooth`` (sigma in pixels of
+        a Gaussian on both images before matching), ``uniqueness`` (percent by which the best rival must cost more,
+        or the pixel is invalid), ``smp`` (bool, single
         matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the image),
         ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of
         the cost's range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the
@@ -166,6 +168,8 @@ class Matcher:
         self.median = int(merged["median"])
         outside = merged["outside"]
         self.outside = None if outside is None else check_number("outside", outside, 0, 1)
+        self.smooth = check_number("smooth", merged["smooth"], 0, 10)
+        self.uniqueness = check_number("uniqueness", merged["uniqueness"], 0, 100)
         self.speckle = check_number("speckle", merged["speckle"], 0, 1)
         self.smp = check_flag("smp", merged["smp"])
         self.subpixel = check_flag("subpixel", merged["subpixel"])
@@ -214,6 +218,7 @@ class Matcher:
 
     def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace) -> Disparity:
         levels = Levels(low, high - low)
+        pair = smooth(pair, self.smooth)
         shape = pair.left.shape
         rows = self.cost.prepare(
             Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, self.threads),
@@ -223,7 +228,9 @@ class Matcher:
         disparity = np.empty(shape, np.float32)
         cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
         confidence = np.empty(shape, np.float32) if self.confidence else None
-        out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel)
+        out = winners_like(
+            disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness
+        )
         self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, self.threads, out)
         if pair.left_bad is not None:
             disparity[pair.left_bad] = np.nan

@@ -40,24 +40,33 @@ class Sgm:
     ----------
     p1 : float or None
         Penalty for a step of one level, in the cost's own unit: neighbours that differ for census, the scale of
-        ``C = min(1 - rho, 1)`` for ZNCC. None takes 0.2 times the cost's range.
+        ``C = min(1 - rho, 1)`` for ZNCC. None takes half the cost's range.
     p2 : float or None
-        Penalty for a larger step, in the same unit. None takes 2.5 times the range. Costs and p2 together must
+        Penalty for a larger step, in the same unit. None takes 2.75 times the range. Costs and p2 together must
         not exceed 255 steps of the 8-bit path costs.
-    paths : {8, 5, 4}
-        Directions: all eight; the five that need only one sweep (all but those from below; one thread and next to
-        no memory); left, right, up and down.
+    paths : {4, 5, 8}
+        Directions: left, right, up and down; the five that need only one sweep (all but those from below; one
+        thread and next to no memory); all eight.
+    edge : float
+        Grey difference of two neighbours, in levels of 0..255, from which the penalties of the step between them
+        are lower: disparity jumps where the image does (Hirschmueller 2008, section II-B, in two levels).
+    edge_factor : float
+        What the penalties are multiplied by there, 0 to 1; 1 for penalties that do not follow the image.
     """
 
     p1: float | None = None
     p2: float | None = None
-    paths: int = 8
+    paths: int = 4
+    edge: float = 8.0
+    edge_factor: float = 0.5
     name: ClassVar[str] = "sgm"
     total_dtype: ClassVar[Any] = np.uint16
 
     def __post_init__(self) -> None:
         if self.paths not in (4, 5, 8):
             raise OptionError(f"paths must be 4, 5 or 8, got {self.paths!r}")
+        check_number("edge", self.edge, 0, 1e6)
+        check_number("edge_factor", self.edge_factor, 0, 1)
 
     def penalties(self, cost_max: int, unit: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Return P1 and P2 by grey difference between the two pixels of a step, in steps of cost, each (256,).
@@ -67,13 +76,17 @@ class Sgm:
         OptionError
             If p1 is not from 0 to p2, or p2 does not fit 8-bit path costs.
         """
-        p1 = 0.2 * cost_max / unit if self.p1 is None else check_number("p1", self.p1, 0, 255)
-        p2 = 2.5 * cost_max / unit if self.p2 is None else check_number("p2", self.p2, 0, 255)
+        p1 = 0.5 * cost_max / unit if self.p1 is None else check_number("p1", self.p1, 0, 255)
+        p2 = 2.75 * cost_max / unit if self.p2 is None else check_number("p2", self.p2, 0, 255)
         if p1 > p2:
             raise OptionError(f"p1 must be at most p2, got p1={p1:g} and p2={p2:g}")
-        if cost_max + round(p2 * unit) > 255:
+        if cost_max + round(p2 * unit) > 255 and self.p2 is not None:
             raise OptionError(f"p2 must be at most {(255 - cost_max) / unit:.4g} with this cost, got {p2:g}")
-        return np.full(256, round(p1 * unit), np.uint8), np.full(256, round(p2 * unit), np.uint8)
+        high = min(round(p2 * unit), 255 - cost_max)
+        steps = np.array([min(round(p1 * unit), high), high])
+        factors = np.where(np.arange(256) < self.edge, 1.0, self.edge_factor)
+        low, high_table = (np.rint(step * factors).astype(np.uint8) for step in steps)
+        return low, np.maximum(high_table, low)
 
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,

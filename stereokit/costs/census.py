@@ -129,11 +129,12 @@ def _census_row(rows: CensusRows, y: int, out: NDArray[np.uint8]) -> None:
     right = y * planes * rows.right_stride
     for x in range(cells.width):
         k = cells.width - 1 - x
-        for block in range(0, cells.padded, LANES):
+        for n in range(len(cells.blocks)):
+            block = n * LANES
             cost = splat(np.uint8(0))
             for p in range(planes):
                 mine = splat(rows.left[left + p * rows.left_stride + x])
                 theirs = load(rows.right, right + p * rows.right_stride + k + block)
                 cost = add(cost, count_bits(xor(mine, theirs)))
-            store(out, x * cells.padded + block, cost)
+            store(out, x * LANES * len(cells.blocks) + block, cost)
     close_row(cells, y, out)

@@ -103,6 +103,7 @@ class Cells(NamedTuple):
     """Which cells of a row of costs have no evidence (flat arrays, for kernels)."""
 
     width: int
+    blocks: tuple[int, ...]  # one element per 64 levels: its length is known to the compiler
     padded: int
     minimum: int
     outside: np.uint8  # cost of a cell without evidence
@@ -154,7 +155,7 @@ def cells_of(pair: Pair, cost_max: int, workspace: Workspace) -> Cells:
     padding[: levels.count] = 0
     padding[levels.count :] = WORST
     return Cells(
-        width, levels.padded, levels.minimum, outside, low.ravel(), high.ravel(), 0 if shared else stride,
+        width, tuple(range(levels.padded // LANES)), levels.padded, levels.minimum, outside, low.ravel(), high.ravel(), 0 if shared else stride,
         left_bad, padding,
     )  # fmt: skip
 

@@ -17,13 +17,15 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Pair, Cells, close_row, implements, pad_pair, cells_of
 from stereokit.errors import OptionError
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
-from stereokit.kernels.simd import LANES, add, convert, load, maximum, minimum, multiply, splat, store, subtract
+from stereokit.kernels.simd import LANES, add, convert, load, maximum, multiply, splat, store, subtract
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import COSTS
 
@@ -63,7 +65,7 @@ class Zncc:
     """
 
     window: int = 5
-    steps: int = 63
+    steps: int = 31
     name: ClassVar[str] = "zncc"
 
     def __post_init__(self) -> None:
@@ -128,14 +130,13 @@ class Zncc:
         return rows
 
     def _in_range(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Return `image` scaled, if need be, so that its range is at most `range_max`: rho does not change."""
+        """Return `image` centred around 0 and, if need be, scaled to `range_max`: rho does not change."""
         if image.dtype == np.uint8 and self.range_max >= 255:
-            return image
+            return (image ^ np.uint8(128)).view(np.int8)
         low, high = int(image.min()), int(image.max())
-        if high - low <= self.range_max and high < 2**15:
-            return image
         factor = min(1.0, self.range_max / max(high - low, 1))
-        return np.rint((image.astype(np.float64) - low) * factor).astype(np.uint16)
+        middle = (low + high) / 2
+        return np.rint((image.astype(np.float64) - middle) * factor).astype(np.int16)
 
 
 @kernel
@@ -175,20 +176,42 @@ def _statistics(
             square -= squares[x]
 
 
+def _products(a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
+    """a * row_a - b * row_b as int32 vectors; compiled code only."""
+    raise NotImplementedError("compiled code only")
+
+
+@overload(_products, strict=False, jit_options={"forceinline": True})
+def _choose_products(a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
+    wide = types.int16 if row_a.scalar == types.int8 else types.int32
+    like = np.int16(0) if wide == types.int16 else np.int32(0)
+
+    def products(a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
+        # Products of int8 are at most 2**14 and at least -2**14 + 2**7, so that their difference fits int16.
+        first = multiply(splat(wide(a)), convert(row_a, like))
+        second = multiply(splat(wide(b)), convert(row_b, like))
+        return convert(subtract(first, second), np.int32(0))
+
+    return products
+
+
 @inline
-def _slide(rows: ZnccRows, image_row: int, sign: int) -> None:
-    """Add (sign 1) or take away (-1) the products of one padded image row to or from the column sums."""
+def _slide(rows: ZnccRows, row_in: int, row_out: int) -> None:
+    """Add the products of padded image row `row_in` to the column sums, take away those of `row_out` if >= 0."""
     cells = rows.cells
-    left = image_row * rows.left_stride
-    right = image_row * rows.right_stride
-    kind = np.int32(0)
-    for c in range(cells.width + 2 * rows.half):
-        mine = splat(np.int32(sign * np.int32(rows.left[left + c])))
-        k = right + cells.width - 1 + 2 * rows.half - c
-        for block in range(0, cells.padded, LANES):
-            product = multiply(mine, convert(load(rows.right, k + block), kind))
-            at = c * cells.padded + block
-            store(rows.sums, at, add(load(rows.sums, at), product))
+    columns = cells.width + 2 * rows.half
+    gone = max(row_out, 0)
+    zero = rows.left.dtype.type(0)
+    for c in range(columns):
+        new = rows.left[row_in * rows.left_stride + c]
+        old = rows.left[gone * rows.left_stride + c] if row_out >= 0 else zero
+        k = columns - 1 - c
+        for n in range(len(cells.blocks)):
+            block = n * LANES
+            theirs_new = load(rows.right, row_in * rows.right_stride + k + block)
+            theirs_old = load(rows.right, gone * rows.right_stride + k + block)
+            at = c * LANES * len(cells.blocks) + block
+            store(rows.sums, at, add(load(rows.sums, at), _products(new, theirs_new, old, theirs_old)))
 
 
 @inline
@@ -197,15 +220,13 @@ def _move(rows: ZnccRows, y: int) -> None:
     window = 2 * rows.half + 1
     last = rows.at[0]
     if last >= 0 and y == last + 1:
-        _slide(rows, y + window - 1, 1)
-        _slide(rows, last, -1)
+        _slide(rows, y + window - 1, last)
     elif last >= 0 and y == last - 1:
-        _slide(rows, y, 1)
-        _slide(rows, last + window - 1, -1)
+        _slide(rows, y, last + window - 1)
     elif y != last:
         rows.sums[:] = 0
         for row in range(y, y + window):
-            _slide(rows, row, 1)
+            _slide(rows, row, -1)
     rows.at[0] = y
 
 
@@ -215,23 +236,23 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
     _move(rows, y)
     cells = rows.cells
     window = 2 * rows.half + 1
+    padded = LANES * len(cells.blocks)
     count = splat(np.int32(window * window))
-    most = splat(np.float32(rows.steps))
-    half = splat(np.float32(0.5))
+    most = splat(np.float32(rows.steps) + np.float32(0.5))
     zero = splat(np.float32(0))
-    for block in range(0, cells.padded, LANES):
+    for n in range(len(cells.blocks)):
+        block = n * LANES
         total = load(rows.sums, block)
         for c in range(1, window):
-            total = add(total, load(rows.sums, c * cells.padded + block))
+            total = add(total, load(rows.sums, c * padded + block))
         for x in range(cells.width):
             k = y * rows.right_width + cells.width - 1 - x + block
             mine = splat(rows.left_sum[y * cells.width + x])
             numerator = subtract(multiply(count, total), multiply(mine, load(rows.right_sum, k)))
             scale = multiply(splat(rows.left_scale[y * cells.width + x]), load(rows.right_scale, k))
             rho = maximum(multiply(convert(numerator, np.float32(0)), scale), zero)
-            cost = maximum(add(subtract(most, minimum(rho, most)), half), zero)
-            store(out, x * cells.padded + block, convert(cost, np.uint8(0)))
+            store(out, x * padded + block, convert(subtract(most, rho), np.uint8(0)))
             if x + 1 < cells.width:
-                total = add(total, load(rows.sums, (x + window) * cells.padded + block))
-                total = subtract(total, load(rows.sums, x * cells.padded + block))
+                total = add(total, load(rows.sums, (x + window) * padded + block))
+                total = subtract(total, load(rows.sums, x * padded + block))
     close_row(cells, y, out)

@@ -29,6 +29,7 @@ class Winners(NamedTuple):
     levels: int
     minimum: int
     subpixel: bool
+    uniqueness: np.float32  # margin to the best rival below which a pixel is invalid, 0 to 1
 
 
 @dataclass(frozen=True)
@@ -82,28 +83,35 @@ def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int,
             disparity += (before - behind) / (np.float32(2) * bend)
     out.disparity[to] = disparity
     out.cost[to] = values[at + level]
-    if out.confidence.size > 0:
-        first = max(level - 1, 0)
-        behind_last = min(level + 2, out.levels)
-        held_0 = keys[at + first]
-        held_1 = keys[at + level]
-        held_2 = keys[at + behind_last - 1]
-        most = keys.dtype.type(2 ** (8 * keys.itemsize - 1) - 1)
-        keys[at + first] = most
-        keys[at + level] = most
-        keys[at + behind_last - 1] = most
-        _, other = _best_level(keys, at, padded)
-        rival = np.float32(values[at + other])
-        keys[at + level] = held_1
-        keys[at + first] = held_0
-        keys[at + behind_last - 1] = held_2
-        alone = other >= out.levels or (other >= first and other < behind_last)
-        if alone:
-            out.confidence[to] = np.float32(1)
-        elif rival > np.float32(0):
-            out.confidence[to] = (rival - best) / rival
-        else:
-            out.confidence[to] = np.float32(0)
+    if out.confidence.size > 0 or out.uniqueness > np.float32(0):
+        margin = _margin(keys, values, at, padded, level, out.levels)
+        if out.confidence.size > 0:
+            out.confidence[to] = margin
+        if margin < out.uniqueness:
+            out.disparity[to] = np.nan
+
+
+@inline
+def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int, level: int, levels: int) -> Any:
+    """``(c2 - c1) / c2`` with c2 the lowest cost that is not next to the winner's; 1 when there is no other."""
+    first = max(level - 1, 0)
+    behind_last = min(level + 2, levels)
+    best = np.float32(values[at + level])
+    held_0 = keys[at + first]
+    held_1 = keys[at + level]
+    held_2 = keys[at + behind_last - 1]
+    most = keys.dtype.type(2 ** (8 * keys.itemsize - 1) - 1)
+    keys[at + first] = most
+    keys[at + level] = most
+    keys[at + behind_last - 1] = most
+    _, other = _best_level(keys, at, padded)
+    rival = np.float32(values[at + other])
+    keys[at + level] = held_1
+    keys[at + first] = held_0
+    keys[at + behind_last - 1] = held_2
+    if other >= levels or (other >= first and other < behind_last):
+        return np.float32(1)
+    return (rival - best) / rival if rival > np.float32(0) else np.float32(0)
 
 
 @kernel
@@ -115,11 +123,11 @@ def select_row(keys: NDArray[Any], values: NDArray[Any], width: int, padded: int
 
 def winners_like(
     disparity: NDArray[np.float32], cost: NDArray[Any], confidence: NDArray[np.float32] | None,
-    levels: int, minimum_disparity: int, subpixel: bool,
+    levels: int, minimum_disparity: int, subpixel: bool, uniqueness: float = 0.0,
 ) -> Winners:  # fmt: skip
     """Return the flat view of the maps that kernels write."""
     flat = np.empty(0, np.float32) if confidence is None else confidence.ravel()
-    return Winners(disparity.ravel(), cost.ravel(), flat, levels, minimum_disparity, subpixel)
+    return Winners(disparity.ravel(), cost.ravel(), flat, levels, minimum_disparity, subpixel, np.float32(uniqueness / 100))
 
 
 def select(

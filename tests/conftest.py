@@ -1,0 +1,68 @@
+"""What all tests share: the environment, the folder of real data, a helper for fresh interpreters.
+
+Compiled kernels are kept in ``.numba_cache`` in the repository unless ``NUMBA_CACHE_DIR`` is set, so that only the
+first run compiles. Thread counts are held low before numpy loads: the machines that run tests are shared.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".numba_cache"))
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+settings.register_profile("stereokit", derandomize=True, deadline=None, max_examples=20)
+settings.load_profile("stereokit")
+
+
+@pytest.fixture(scope="session")
+def data_root():
+    """Return the folder of real stereo pairs, or skip."""
+    folder = Path(os.environ.get("STEREOKIT_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real stereo pairs in {folder}; set STEREOKIT_DATA")
+    return folder
+
+
+@pytest.fixture
+def random_pair():
+    """Return a function that makes a random grey pair of a size, type and seed."""
+
+    def make(height, width, seed=0, dtype=np.uint8, high=256):
+        rng = np.random.default_rng(seed)
+        return tuple(rng.integers(0, high, (height, width)).astype(dtype) for _ in range(2))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def run_python():
+    """Return a function that runs python in a new process with the packages under test and returns its output."""
+
+    def run(*arguments, timeout=300, **environment):
+        import stereokit
+        import stereokit_refiners
+
+        packages = {str(Path(module.__file__).parents[1]) for module in (stereokit, stereokit_refiners)}
+        path = os.pathsep.join([*sorted(packages), *filter(None, [os.environ.get("PYTHONPATH")])])
+        done = subprocess.run(
+            [sys.executable, *map(str, arguments)],
+            env={**os.environ, "PYTHONPATH": path, **environment},
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run

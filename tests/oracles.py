@@ -1,0 +1,272 @@
+"""Reference forms of every stage of the matching core: plain loops, written from the papers, slow and exact.
+
+Nothing here imports stereokit. Conventions that papers leave open (ties, borders, rounding) are those that the
+package documents. Disparity ``d`` of level ``k`` is ``k + minimum``; the right pixel is column ``x - d``; volumes are
+``(H, W, D)``.
+
+References
+----------
+R. Zabih, J. Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994.
+H. Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 2008.
+E. Gastal, M. Oliveira, "Domain transform for edge-aware image and video processing", SIGGRAPH 2011.
+L. Di Stefano, M. Marchionni, S. Mattoccia, "A fast area-based stereo matching algorithm", IVC 2004.
+Q. Chang et al., "StereoVAE", ICRA 2023.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+ACROSS = [(0, 1), (0, -1)]
+FROM_ABOVE = [(1, 0), (1, 1), (1, -1)]
+FROM_BELOW = [(-1, 0), (-1, 1), (-1, -1)]
+DIRECTIONS = {4: [*ACROSS, (1, 0), (-1, 0)], 5: ACROSS + FROM_ABOVE, 8: ACROSS + FROM_ABOVE + FROM_BELOW}
+"""Steps ``(dy, dx)`` from one pixel of a path to the next, by number of paths."""
+
+
+def _clamped(image, y, x):
+    height, width = image.shape
+    return int(image[min(max(y, 0), height - 1), min(max(x, 0), width - 1)])
+
+
+def _volume(left, right, minimum, count, cost, outside, dtype):
+    """Fill a volume with ``cost(y, x, xr)``; cells whose right pixel is outside get `outside` unless it is None."""
+    height, width = left.shape
+    volume = np.empty((height, width, count), dtype)
+    for y in range(height):
+        for x in range(width):
+            for k in range(count):
+                xr = x - k - minimum
+                is_out = outside is not None and not 0 <= xr < width
+                volume[y, x, k] = outside if is_out else cost(y, x, xr)
+    return volume
+
+
+def census_bits(image, y, x, across, down):
+    """Zabih and Woodfill's transform: which neighbours of the window are darker than the pixel."""
+    centre = _clamped(image, y, x)
+    offsets = [(dy, dx) for dy in range(-down, down + 1) for dx in range(-across, across + 1)]
+    return [_clamped(image, y + dy, x + dx) < centre for dy, dx in offsets if (dy, dx) != (0, 0)]
+
+
+def census(left, right, minimum, count, width=9, height=7, outside=1.0):
+    """Hamming distances of census transforms; `outside` is a share of the largest, or None for clamped borders."""
+    across, down = width // 2, height // 2
+    largest = width * height - 1
+    held = {}
+
+    def bits(name, image, y, x):
+        if (name, y, x) not in held:
+            held[name, y, x] = census_bits(image, y, x, across, down)
+        return held[name, y, x]
+
+    def cost(y, x, xr):
+        a, b = bits("left", left, y, x), bits("right", right, y, xr)
+        return sum(p != q for p, q in zip(a, b, strict=True))
+
+    worst = None if outside is None else round(outside * largest)
+    return _volume(left, right, minimum, count, cost, worst, np.int64)
+
+
+def zncc(left, right, minimum, count, window=5, outside=1.0):
+    """``min(1 - rho, 1)`` in float64 (StereoVAE eq. 1-3); 1 where a window has no variance."""
+    half = window // 2
+    span = range(-half, half + 1)
+
+    def patch(image, y, x):
+        return [_clamped(image, y + dy, x + dx) for dy in span for dx in span]
+
+    def cost(y, x, xr):
+        a, b = patch(left, y, x), patch(right, y, xr)
+        mean_a, mean_b = sum(a) / len(a), sum(b) / len(b)
+        a, b = [v - mean_a for v in a], [v - mean_b for v in b]
+        if len(set(a)) == 1 or len(set(b)) == 1:
+            return 1.0
+        product = sum(p * q for p, q in zip(a, b, strict=True))
+        rho = product / (math.sqrt(sum(p * p for p in a)) * math.sqrt(sum(q * q for q in b)))
+        return min(1 - rho, 1.0)
+
+    return _volume(left, right, minimum, count, cost, outside, np.float64)
+
+
+def sgm(volume, p1, p2, directions):
+    """Sum over `directions` of the path costs (Hirschmueller 2008, eq. 13-14), in integers."""
+    height, width, count = volume.shape
+    total = np.zeros(volume.shape, np.int64)
+    for dy, dx in directions:
+        path = np.zeros(volume.shape, np.int64)
+        rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
+        columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
+        for y in rows:
+            for x in columns:
+                here = [int(c) for c in volume[y, x]]
+                if 0 <= y - dy < height and 0 <= x - dx < width:
+                    before = [int(c) for c in path[y - dy, x - dx]]
+                    least = min(before)
+                    for d in range(count):
+                        best = min(before[d], least + p2)
+                        if d > 0:
+                            best = min(best, before[d - 1] + p1)
+                        if d < count - 1:
+                            best = min(best, before[d + 1] + p1)
+                        here[d] += best - least
+                path[y, x] = here
+        total += path
+    return total
+
+
+def domain_transform(plane, guide, sigma_s, sigma_r, passes):
+    """Recursive filter of one slice, ``(H, W)``, float64 (Gastal and Oliveira 2011, eq. 14 and 21)."""
+    values = np.array(plane, np.float64)
+    grey = np.array(guide, np.float64)
+    for i in range(1, passes + 1):
+        sigma = sigma_s * math.sqrt(3) * 2.0 ** (passes - i) / math.sqrt(4.0**passes - 1)
+        a = math.exp(-math.sqrt(2) / sigma)
+        for image, edges in ((values, grey), (values.T, grey.T)):  # views: rows, then columns
+            for line, edge in zip(image, edges, strict=True):
+                weight = [a ** (1 + sigma_s / sigma_r * abs(edge[n] - edge[n - 1])) for n in range(1, len(line))]
+                for n in range(1, len(line)):
+                    line[n] += weight[n - 1] * (line[n - 1] - line[n])
+                for n in range(len(line) - 2, -1, -1):
+                    line[n] += weight[n] * (line[n + 1] - line[n])
+    return values
+
+
+def cascade(plane, guide):
+    """Plain sum of the StereoVAE authors: right, left, down, up, each on what the one before left, float64."""
+    values = np.array(plane, np.float64)
+    grey = np.array(guide, np.int64)
+    height, width = values.shape
+    for y in range(height):
+        for x in range(1, width):
+            values[y, x] += math.exp(-abs(grey[y, x] - grey[y, x - 1]) / 52) * values[y, x - 1]
+        for x in range(width - 2, -1, -1):
+            values[y, x] += math.exp(-abs(grey[y, x] - grey[y, x + 1]) / 52) * values[y, x + 1]
+
+    def vertical(jump):
+        return 0.8 if jump < 5 else math.exp(-jump / 52)
+
+    for x in range(width):
+        for y in range(1, height):
+            values[y, x] += vertical(abs(grey[y, x] - grey[y - 1, x])) * values[y - 1, x]
+        for y in range(height - 2, -1, -1):
+            values[y, x] += vertical(abs(grey[y, x] - grey[y + 1, x])) * values[y + 1, x]
+    return values
+
+
+def slices(filter_plane, volume, *arguments):
+    """Apply a filter of one slice to every slice of a volume."""
+    parts = [filter_plane(volume[:, :, d], *arguments) for d in range(volume.shape[2])]
+    return np.stack(parts, axis=2)
+
+
+def winner(costs, minimum=0, subpixel=True):
+    """Return ``(disparity, cost, confidence)`` of one pixel: lowest cost, the lowest level of equals, a parabola."""
+    costs = [float(c) for c in costs]
+    best = min(costs)
+    level = costs.index(best)
+    disparity = level + minimum
+    if subpixel and 0 < level < len(costs) - 1:
+        before, behind = costs[level - 1], costs[level + 1]
+        bend = before + behind - 2 * best
+        if bend > 0:
+            disparity += (before - behind) / (2 * bend)
+    others = [c for k, c in enumerate(costs) if abs(k - level) > 1]
+    if not others:
+        return disparity, best, 1.0
+    rival = min(others)
+    return disparity, best, (rival - best) / rival if rival > 0 else 0.0
+
+
+def select(volume, minimum=0, subpixel=True):
+    """Winner takes all over a volume; three maps."""
+    flat = [winner(costs, minimum, subpixel) for row in volume for costs in row]
+    return tuple(np.array(part).reshape(volume.shape[:2]) for part in zip(*flat, strict=True))
+
+
+def single_matching_phase(disparity, cost):
+    """Keep the cheapest of all pixels whose match rounds to one right pixel; of equals the larger disparity."""
+    height, width = disparity.shape
+    out = np.full(disparity.shape, np.nan)
+    for y in range(height):
+        claims = {}
+        for x in range(width):
+            if not math.isnan(disparity[y, x]):
+                claims.setdefault(math.floor(x - float(disparity[y, x]) + 0.5), []).append(x)
+        for xr, columns in claims.items():
+            if 0 <= xr < width:
+                x = min(columns, key=lambda x, y=y: (cost[y, x], -disparity[y, x]))
+                out[y, x] = disparity[y, x]
+    return out
+
+
+def fill(disparity, mode):
+    """Fill gaps along rows, then rows without any value from the nearest row that has some (upper of equals)."""
+    out = np.array(disparity, np.float64)
+    full = []
+    for y, row in enumerate(disparity):
+        known = [x for x in range(len(row)) if not math.isnan(row[x])]
+        if known:
+            full.append(y)
+        for x in range(len(row)):
+            before = [k for k in known if k <= x][-1:]
+            behind = [k for k in known if k >= x][:1]
+            ends = [(abs(x - k), float(row[k])) for k in before + behind]
+            if ends:
+                out[y, x] = min(ends)[1] if mode == "nearest" else min(value for _, value in ends)
+    for y in range(len(out)):
+        if full and y not in full:
+            out[y] = out[min(full, key=lambda k, y=y: (abs(k - y), k))]
+    return out
+
+
+def median(disparity, size):
+    """Median of the valid values of the window, borders replicated; the lower of the two middle ones."""
+    height, width = disparity.shape
+    half = size // 2
+    out = np.full(disparity.shape, np.nan)
+    for y in range(height):
+        for x in range(width):
+            if math.isnan(disparity[y, x]):
+                continue
+            held = [
+                float(disparity[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)])
+                for dy in range(-half, half + 1)
+                for dx in range(-half, half + 1)
+            ]
+            held = sorted(v for v in held if not math.isnan(v))
+            out[y, x] = held[(len(held) - 1) // 2]
+    return out
+
+
+def halve(image):
+    """Mean of each 2x2 pixels, float64; odd sizes are extended by their last row or column."""
+    height, width = image.shape
+    out = np.empty(((height + 1) // 2, (width + 1) // 2))
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            four = [_clamped(image, 2 * y + dy, 2 * x + dx) for dy in (0, 1) for dx in (0, 1)]
+            out[y, x] = sum(four) / 4
+    return out
+
+
+def double(image, height, width):
+    """Bilinear upscaling by two with pixel centres kept: full pixel i lies at ``(i + 0.5) / 2 - 0.5``."""
+
+    def weights(i, size):
+        at = (i + 0.5) / 2 - 0.5
+        low = math.floor(at)
+        ends = [(low, 1 - (at - low)), (low + 1, at - low)]
+        return [(min(max(k, 0), size - 1), share) for k, share in ends]
+
+    out = np.empty((height, width))
+    for y in range(height):
+        for x in range(width):
+            out[y, x] = sum(
+                a * b * float(image[j, i])
+                for j, a in weights(y, image.shape[0])
+                for i, b in weights(x, image.shape[1])
+            )
+    return out

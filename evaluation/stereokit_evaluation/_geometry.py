@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ._textures import Look
+from stereokit_evaluation._textures import Look
 
 __all__ = ["Camera", "Patch", "Plane", "covers", "occlusion", "plane_of", "rasterise"]
 

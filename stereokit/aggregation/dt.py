@@ -90,9 +90,9 @@ class Dt:
         Which of the two published forms.
     """
 
-    sigma_s: float = 14.0
+    sigma_s: float = 10.0
     sigma_v: float | None = 6.0
-    sigma_r: float = 90.0
+    sigma_r: float = 30.0
     passes: int = 1
     mode: str = "rf"
     name: ClassVar[str] = "dt"

@@ -1,0 +1,88 @@
+"""Linear upscaling against loops, and inside a half-size match."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracles
+import pytest
+
+import stereokit
+from stereokit import Disparity
+from stereokit_refiners import Linear
+
+NAN = np.nan
+SIZES = [(8, 12), (7, 11), (1, 1), (1, 9), (9, 1), (2, 3)]
+"""Full sizes; the half-size map has half of each, rounded up."""
+
+
+def coarse_of(size, seed=0, gaps=0.0):
+    rng = np.random.default_rng(seed)
+    shape = tuple(-(-side // 2) for side in size)
+    disparity = (rng.random(shape) * 40).astype(np.float32)
+    disparity[rng.random(shape) < gaps] = NAN
+    valid = ~np.isnan(disparity) & (rng.random(shape) < 0.8)
+    confidence = np.where(valid, rng.random(shape), 0).astype(np.float32)
+    return Disparity(disparity, valid, confidence)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_map_doubles_in_size_and_in_value(size):
+    coarse = coarse_of(size)
+    kept = coarse.disparity.copy()
+    fine = Linear()(coarse, np.zeros(size, np.uint8))
+    np.testing.assert_allclose(fine.disparity, 2 * oracles.double(coarse.disparity, *size), rtol=1e-5)
+    np.testing.assert_array_equal(coarse.disparity, kept)
+    assert fine.disparity.dtype == np.float32
+    assert fine.disparity.shape == fine.valid.shape == fine.confidence.shape == size
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_pixel_is_valid_where_its_half_size_pixel_is(size):
+    coarse = coarse_of(size, 1)
+    fine = Linear()(coarse, np.zeros(size, np.uint8))
+    y, x = np.indices(size)
+    np.testing.assert_array_equal(fine.valid, coarse.valid[y // 2, x // 2])
+    assert fine.confidence.min() >= 0
+    assert fine.confidence.max() <= 1
+    assert (fine.confidence[~fine.valid] == 0).all()
+    expected = oracles.double(coarse.confidence, *size)[fine.valid]
+    np.testing.assert_allclose(fine.confidence[fine.valid], expected, rtol=1e-5)
+
+
+def test_gaps_stay_gaps_and_reach_no_further_than_their_neighbours():
+    coarse = coarse_of((20, 24), 2, gaps=0.1)
+    fine = Linear()(coarse, np.zeros((20, 24), np.uint8))
+    y, x = np.indices((20, 24))
+    own = np.isnan(coarse.disparity)[y // 2, x // 2]
+    assert np.isnan(fine.disparity[own]).all()
+    expected = 2 * oracles.double(coarse.disparity, 20, 24)
+    np.testing.assert_allclose(fine.disparity, expected, rtol=1e-5)
+    assert not fine.valid[np.isnan(fine.disparity)].any()
+
+
+def test_a_ramp_stays_a_ramp():
+    ramp = np.tile(np.arange(6, dtype=np.float32), (4, 1))
+    fine = Linear()(Disparity(ramp, np.ones((4, 6), bool)), np.zeros((8, 12), np.uint8))
+    np.testing.assert_allclose(fine.disparity[:, 1:-1], np.tile(np.arange(10) + 0.5, (8, 1)))
+    assert fine.confidence is None
+
+
+@pytest.mark.parametrize("size", [(22, 40), (21, 39)])
+def test_half_size_matching_is_matching_halved_images_and_upscaling(size):
+    rng = np.random.default_rng(3)
+    # Multiples of four: the mean of four pixels is whole, whichever way halves are rounded.
+    left, right = (rng.integers(0, 64, size).astype(np.uint8) * 4 for _ in range(2))
+    options = {"confidence": True, "smp": True, "median": 3}
+    result = stereokit.Matcher("census+sgm", max_disparity=31, min_disparity=-3, scale=0.5, **options)(left, right)
+    halves = (oracles.halve(image).astype(np.uint8) for image in (left, right))
+    coarse = stereokit.Matcher("census+sgm", max_disparity=16, min_disparity=-2, **options)(*halves)
+    fine = Linear()(coarse, left)
+    np.testing.assert_array_equal(result.disparity, fine.disparity)
+    np.testing.assert_array_equal(result.valid, fine.valid)
+    np.testing.assert_array_equal(result.confidence, fine.confidence)
+
+
+def test_linear_is_the_default_refiner_of_half_size():
+    matcher = stereokit.Matcher("census+sgm", max_disparity=16, scale=0.5)
+    assert matcher.refiner == "linear"
+    assert stereokit.REFINERS.get("Linear") is Linear

@@ -1,0 +1,368 @@
+"""Images in every form, and the errors of those and of options that cannot be used."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracles
+import pytest
+
+import stereokit
+from stereokit import InputError, Matcher, OptionError, StereokitError, UnknownNameError, match
+from stereokit.inputs import gray_pair, half_size
+
+METHOD = "census+sgm"
+
+
+def matched(left, right, **options):
+    return match(left, right, METHOD, max_disparity=16, **options)
+
+
+def pair_of(shape=(13, 30), seed=0, dtype=np.uint8, high=256):
+    rng = np.random.default_rng(seed)
+    return tuple(rng.integers(0, high, shape).astype(dtype) for _ in range(2))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+@pytest.mark.parametrize("method", stereokit.METHODS.values())
+def test_types_that_hold_the_same_values_give_the_same_map(method, dtype):
+    left, right = pair_of()
+    expected = match(left, right, method, max_disparity=16)
+    np.testing.assert_array_equal(match(left.astype(dtype), right.astype(dtype), method, max_disparity=16), expected)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_colours_that_hold_the_same_values_give_the_same_map(dtype):
+    left, right = pair_of((13, 30, 3), 1)
+    np.testing.assert_array_equal(matched(left.astype(dtype), right.astype(dtype)), matched(left, right))
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
+def test_floats_that_hold_16_bits_give_the_map_of_16_bits(dtype):
+    left, right = pair_of(dtype=np.uint16, high=65536)
+    np.testing.assert_array_equal(matched(left.astype(dtype), right.astype(dtype)), matched(left, right))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("gain", "offset"), [(1 / 256, 0), (1024, -5), (2.0**100, 0), (-1, 0), (2.0**-60, 0)])
+def test_floats_of_any_range_are_used_in_full(dtype, gain, offset):
+    # Census compares grey values: any map that keeps their order (or turns it in both images) keeps the costs.
+    left, right = (np.clip(image, 1, 255) for image in pair_of(seed=2))
+    volume = stereokit.cost_volume(left, right, "census", max_disparity=9)
+    moved = [image.astype(dtype) * dtype(gain) + dtype(offset) for image in (left, right)]
+    if gain < 0:
+        volume = stereokit.cost_volume(255 - left, 255 - right, "census", max_disparity=9)
+    np.testing.assert_array_equal(stereokit.cost_volume(*moved, "census", max_disparity=9), volume)
+
+
+def test_the_whole_range_of_float64_is_no_overflow():
+    left, right = (image.astype(np.float64) for image in pair_of(seed=3))
+    low, high = np.finfo(np.float64).min, np.finfo(np.float64).max
+    left[0, 0], right[0, 0] = low, high
+    assert np.isfinite(matched(left, right)).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+def test_rgb_is_grey_by_the_usual_weights(dtype):
+    left, right = pair_of((9, 20, 3), 4, dtype)
+    grey = gray_pair(left, right).left.astype(float)
+    assert abs(grey - left @ [0.299, 0.587, 0.114]).max() < 1 or dtype in (np.float32, np.float64)
+    pure = np.zeros((1, 3, 3), np.uint8)
+    pure[0, range(3), range(3)] = 255
+    np.testing.assert_array_equal(gray_pair(pure, pure).left, [[76, 150, 29]])  # red, green, blue
+
+
+def test_grey_may_have_a_channel_axis():
+    left, right = pair_of(seed=5)
+    np.testing.assert_array_equal(matched(left[:, :, None], right[:, :, None]), matched(left, right))
+    np.testing.assert_array_equal(matched(left[:, :, None], right), matched(left, right))
+
+
+VIEWS = {
+    "reversed rows": lambda a: a[::-1],
+    "reversed columns": lambda a: a[:, ::-1],
+    "every second": lambda a: a[::2, ::2],
+    "part": lambda a: a[1:-2, 3:-1],
+    "transposed": lambda a: a.swapaxes(0, 1),
+    "fortran": np.asfortranarray,
+    "read only": lambda a: np.frombuffer(a.tobytes(), a.dtype).reshape(a.shape),
+    "broadcast": lambda a: np.broadcast_to(a[:1], a.shape),
+    "unaligned": lambda a: np.frombuffer(b"x" + a.tobytes(), np.uint8)[1:].view(a.dtype).reshape(a.shape),
+}
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+@pytest.mark.parametrize("shape", [(14, 30), (14, 30, 3)], ids=["grey", "colour"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_views_give_what_their_copies_give_and_stay_as_they_are(view, shape, dtype):
+    left, right = (view(image) for image in pair_of(shape, 6, dtype))
+    copies = np.array(left, order="C"), np.array(right, order="C")
+    np.testing.assert_array_equal(matched(left, right), matched(*copies))
+    np.testing.assert_array_equal(left, copies[0])
+    np.testing.assert_array_equal(right, copies[1])
+
+
+def test_unaligned_16_bits():
+    left, right = (VIEWS["unaligned"](image) for image in pair_of(seed=7, dtype=np.uint16, high=4000))
+    assert not left.flags.aligned
+    np.testing.assert_array_equal(matched(left, right), matched(left.copy(), right.copy()))
+
+
+@pytest.mark.parametrize("method", stereokit.METHODS.values())
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float64])
+def test_inputs_are_never_modified(method, dtype):
+    pair = pair_of(seed=8, dtype=dtype, high=250)
+    if dtype == np.float64:
+        pair[0][2, 3], pair[1][4, 5] = np.nan, np.inf
+    copies = [image.copy() for image in pair]
+    for scale in (1, 0.5):
+        match(*pair, method, max_disparity=16, scale=scale)
+        Matcher(method, max_disparity=16, scale=scale, right=True, confidence=True)(*pair)
+    for image, copy in zip(pair, copies, strict=True):
+        np.testing.assert_array_equal(image, copy)
+
+
+def test_results_are_not_shared_with_later_calls():
+    left, right = pair_of(seed=9)
+    matcher = Matcher(METHOD, max_disparity=16, confidence=True, smp=False, median=0)
+    first = matcher(left, right)
+    kept = first.disparity.copy(), first.valid.copy(), first.confidence.copy()
+    matcher(right, left)
+    for array, copy in zip((first.disparity, first.valid, first.confidence), kept, strict=True):
+        np.testing.assert_array_equal(array, copy)
+    assert first.disparity.flags.writeable
+    assert not np.shares_memory(first.disparity, left)
+
+
+@pytest.mark.parametrize("method", stereokit.METHODS.values())
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_pixels_that_are_not_finite_are_invalid(method, value):
+    left, right = (image.astype(np.float32) for image in pair_of((15, 40), 10))
+    left[3, 20], left[7, 30] = value, value
+    result = Matcher(method, max_disparity=16, fill=None, smp=False, median=0)(left, right)
+    expected = np.ones((15, 40), bool)
+    expected[3, 20] = expected[7, 30] = False
+    np.testing.assert_array_equal(result.valid, expected)
+    np.testing.assert_array_equal(np.isnan(result.disparity), ~expected)
+    filled = Matcher(method, max_disparity=16)(left, right)
+    assert not filled.valid[~expected].any()
+    assert np.isfinite(filled.disparity).all()
+
+
+@pytest.mark.parametrize("method", stereokit.METHODS.values())
+def test_bad_pixels_of_the_right_image_do_no_harm_elsewhere(method):
+    left = np.random.default_rng(11).integers(0, 256, (30, 80)).astype(np.float32)
+    right = np.roll(left, -6, axis=1)
+    right[15, 40] = np.nan
+    disparity = match(left, right, method, max_disparity=16)
+    assert abs(disparity[:, 20:] - 6).max() < 1
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_colours_that_are_not_finite_are_bad_pixels_without_a_warning(dtype):
+    left, right = pair_of((9, 30, 3), 12, dtype)
+    left[2, 3] = [np.inf, -np.inf, 0]
+    left[4, 5, 1] = np.nan
+    result = Matcher(METHOD, max_disparity=16, fill=None, smp=False, median=0)(left, right)
+    assert list(zip(*np.nonzero(~result.valid), strict=True)) == [(2, 3), (4, 5)]
+
+
+@pytest.mark.parametrize("scale", [1, 0.5])
+def test_an_image_without_any_finite_pixel_has_no_valid_pixel(scale):
+    nothing, right = np.full((6, 20), np.nan), np.random.default_rng(13).random((6, 20))
+    result = Matcher(METHOD, max_disparity=16, scale=scale, confidence=True)(nothing, right)
+    assert not result.valid.any()
+    assert (result.confidence == 0).all()
+
+
+@pytest.mark.parametrize("shape", [(6, 8), (7, 9), (1, 1), (1, 5), (5, 1), (33, 71)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_half_size_is_the_rounded_mean_of_four(shape, dtype):
+    left, right = pair_of(shape, 14, dtype, np.iinfo(dtype).max + 1)
+    half = half_size(gray_pair(left, right))
+    for image, source in ((half.left, left), (half.right, right)):
+        expected = oracles.halve(source)
+        assert image.shape == expected.shape
+        assert abs(image - expected).max() <= 0.5
+    assert half.guide.shape == half.left.shape
+
+
+def test_half_size_is_bad_where_one_of_four_is():
+    left, right = (image.astype(np.float32) for image in pair_of((7, 9), 15))
+    left[6, 8], right[2, 3] = np.nan, np.inf
+    half = half_size(gray_pair(left, right))
+    assert list(zip(*np.nonzero(half.left_bad), strict=True)) == [(3, 4)]
+    assert list(zip(*np.nonzero(half.right_bad), strict=True)) == [(1, 1)]
+
+
+A = np.zeros((4, 5), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "words"),
+    [
+        (A[0], A, ["left", "(5,)"]),
+        (A, A[None, None], ["right", "(1, 1, 4, 5)"]),
+        (np.zeros((4, 5, 4), np.uint8), A, ["left", "(4, 5, 4)"]),
+        (np.zeros((4, 5, 2), np.uint8), A, ["left", "(4, 5, 2)"]),
+        (A[:0], A[:0], ["left", "empty", "(0, 5)"]),
+        (A, A[:, :0], ["right", "empty", "(4, 0)"]),
+        (np.zeros((0, 5, 3), np.uint8), A, ["left", "empty"]),
+        (A, A[:3], ["same size", "(4, 5)", "(3, 5)"]),
+        (A, A.astype(np.float32), ["same type", "uint8", "float32"]),
+        (A.astype(np.int32), A, ["left", "int32", "uint8"]),
+        (A, A.astype(np.float16), ["right", "float16"]),
+        (A.astype(bool), A, ["left", "bool"]),
+        (A.astype(complex), A, ["left", "complex"]),
+        (A.astype(object), A, ["left", "object"]),
+        ("left.png", A, ["left", "uint8"]),
+        (None, A, ["left"]),
+        ([[1, 2], [3]], A, ["left"]),
+    ],
+)
+def test_images_that_cannot_be_used_are_named(left, right, words):
+    for call in (matched, lambda a, b: stereokit.cost_volume(a, b, "census")):
+        with pytest.raises(InputError) as caught:
+            call(left, right)
+        assert all(word in str(caught.value) for word in words), str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+BAD_OPTIONS = [
+    ({"max_disparity": 0}, ["max_disparity", "at least 1", "0"]),
+    ({"max_disparity": 3, "min_disparity": 3}, ["max_disparity", "at least 4", "3"]),
+    ({"max_disparity": 16.0}, ["max_disparity", "integer", "16.0"]),
+    ({"max_disparity": True}, ["max_disparity", "integer", "True"]),
+    ({"max_disparity": "many"}, ["max_disparity", "many"]),
+    ({"max_disparity": None}, ["max_disparity", "None"]),
+    ({"max_disparity": 2049}, ["max_disparity", "2048", "2049"]),
+    ({"min_disparity": 0.5}, ["min_disparity", "0.5"]),
+    ({"scale": 2}, ["scale", "1 or 0.5", "2"]),
+    ({"scale": None}, ["scale", "None"]),
+    ({"scale": "half"}, ["scale", "half"]),
+    ({"device": "tpu"}, ["device", "cpu", "tpu"]),
+    ({"threads": 0}, ["threads", "at least 1", "0"]),
+    ({"threads": -1}, ["threads", "-1"]),
+    ({"threads": 1.5}, ["threads", "1.5"]),
+    ({"refiner": "linear"}, ["refiner", "scale=0.5"]),
+    ({"refiner": "liner", "scale": 0.5}, ["refiner", "liner", "did you mean 'linear'"]),
+    ({"refiner": 3, "scale": 0.5}, ["refiner", "3"]),
+    ({"fill": "foreground"}, ["fill", "foreground", "background"]),
+    ({"fill": 3}, ["fill", "3"]),
+    ({"median": 4}, ["median", "4"]),
+    ({"median": [3]}, ["median", "[3]"]),
+    ({"median": "wide"}, ["median", "wide"]),
+    ({"outside": 1.5}, ["outside", "1.5"]),
+    ({"outside": float("nan")}, ["outside", "nan"]),
+    ({"smp": 1}, ["smp", "True or False", "1"]),
+    ({"subpixel": "parabola"}, ["subpixel", "parabola"]),
+    ({"confidence": None}, ["confidence", "None"]),
+    ({"right": 0}, ["right", "0"]),
+    ({"windw": "9x7"}, ["windw", "did you mean 'window'"]),
+    ({"sigma_s": 20}, ["sigma_s"]),
+    ({"steps": 63}, ["steps"]),
+    ({"window": 9}, ["window", "9x7", "9"]),
+    ({"window": (9, 7)}, ["window", "9x7"]),
+    ({"window": [9, 7]}, ["window", "9x7"]),
+    ({"paths": 16}, ["paths", "16"]),
+    ({"p1": 100, "p2": 50}, ["p1", "p2", "100", "50"]),
+    ({"p2": 1000}, ["p2", "1000"]),
+    ({"p1": "small"}, ["p1", "small"]),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), BAD_OPTIONS, ids=lambda value: repr(value)[:40])
+def test_options_outside_their_rule_are_named(options, words):
+    for call in (lambda **o: Matcher(METHOD, **o), lambda **o: match(A, A, METHOD, **o)):
+        with pytest.raises(OptionError) as caught:
+            call(**options)
+        assert all(word in str(caught.value) for word in words), str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"window": 4}, ["window", "odd", "4"]),
+        ({"window": 1}, ["window", "odd", "1"]),
+        ({"window": 5.0}, ["window", "5.0"]),
+        ({"window": "5x5"}, ["window", "5x5"]),
+        ({"window": 257}, ["window", "255", "257"]),
+        ({"steps": 0}, ["steps", "1 to 254", "0"]),
+        ({"steps": 255}, ["steps", "255"]),
+        ({"steps": 254, "p2": 1}, ["p2", "1"]),
+    ],
+)
+def test_options_of_zncc(options, words):
+    with pytest.raises(OptionError) as caught:
+        Matcher("zncc+sgm", **options)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        ("zncc", ["zncc", "S4"]),
+        ("", ["method", "''"]),
+        ("S5", ["S5", "S4"]),
+        ("zncc+sgn", ["sgn", "did you mean 'sgm'"]),
+        ("senses+sgm", ["senses", "did you mean 'census'"]),
+        ("zncc+sgm+dt", ["zncc+sgm+dt"]),
+        (4, ["method", "4"]),
+        (None, ["method", "None"]),
+        (["zncc", "sgm"], ["method"]),
+    ],
+)
+def test_methods_that_do_not_exist(method, words):
+    for call in (lambda m: Matcher(m), lambda m: match(A, A, m)):
+        with pytest.raises(OptionError) as caught:
+            call(method)
+        assert all(word in str(caught.value) for word in words), str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_numbers_of_numpy_are_numbers():
+    left, right = pair_of(seed=16)
+    expected = match(left, right, "zncc+dt", max_disparity=16, window=5, sigma_s=9.0, passes=1)
+    options = {"max_disparity": np.int64(16), "window": np.int32(5), "sigma_s": np.float32(9), "passes": np.uint8(1)}
+    np.testing.assert_array_equal(match(left, right, "zncc+dt", **options), expected)
+
+
+@pytest.mark.parametrize("options", [{"max_disparity": 16.0}, {"smp": 1}, {"threads": 2.0}])
+def test_a_wrong_type_is_refused_even_if_an_equal_value_was_used_before(options):
+    right_types = {"max_disparity": 16, "smp": True, "threads": 2}
+    match(A, A, METHOD, **{name: right_types[name] for name in options})
+    with pytest.raises(OptionError):
+        match(A, A, METHOD, **options)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: stereokit.cost_volume(A, A, "sad"),
+        lambda: stereokit.cost_volume(A, A, None),
+        lambda: stereokit.cost_volume(A, A, "census", steps=3),
+        lambda: stereokit.cost_volume(A, A, "census", max_disparity=0),
+        lambda: stereokit.cost_volume(A, A, "census", outside=2),
+        lambda: stereokit.cost_volume(A, A, "census", threads=0),
+        lambda: stereokit.aggregate(np.zeros((4, 5, 3), np.uint8), A, "bilateral"),
+        lambda: stereokit.aggregate(np.zeros((4, 5, 3), np.uint8), A, None),
+        lambda: stereokit.aggregate(np.zeros((4, 5, 3), np.uint8), A, "sgm", cost="sad"),
+        lambda: stereokit.aggregate(np.zeros((4, 5, 3), np.uint8), None, "sgm"),
+        lambda: stereokit.select([[[1, 2, 3]]]),
+        lambda: stereokit.select(np.zeros((4, 5, 3), np.uint16), min_disparity=0.5),
+        lambda: stereokit.select(np.zeros((4, 5, 3), np.uint16), subpixel="no"),
+        lambda: stereokit.warmup("S9"),
+    ],
+)
+def test_stages_refuse_what_they_cannot_use(call):
+    with pytest.raises(StereokitError) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_errors_are_one_family_of_value_errors():
+    assert issubclass(UnknownNameError, OptionError)
+    for error in (InputError, OptionError, UnknownNameError):
+        assert issubclass(error, StereokitError)
+        assert issubclass(error, ValueError)

@@ -237,7 +237,9 @@ class Matcher:
         if self.smp:
             disparity = single_matching_phase(disparity, cost, threads=self.threads)
         if self.speckle:
-            disparity = remove_speckles(disparity, int(self.speckle * disparity.size))
+            disparity = remove_speckles(
+                disparity, int(self.speckle * disparity.size), threads=self.threads, workspace=workspace
+            )
         valid = ~np.isnan(disparity)
         if self.fill is not None:
             disparity = fill(disparity, self.fill, threads=self.threads)

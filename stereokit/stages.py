@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume
 from stereokit.errors import InputError, OptionError
 from stereokit.inputs import check_integer, check_number, gray_pair
+from stereokit.inputs import smooth as smoothed
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.workspace import Workspace
 from stereokit.matching import build_aggregation, build_cost
@@ -24,7 +25,7 @@ __all__ = ["aggregate", "cost_volume"]
 
 def cost_volume(
     left: Any, right: Any, cost: str = "zncc", *, max_disparity: int = 128, min_disparity: int = 0,
-    outside: float | None = 1.0, threads: int | None = None, **options: Any,
+    outside: float | None = 1.0, smooth: float = 0.0, threads: int | None = None, **options: Any,
 ) -> NDArray[np.uint8]:  # fmt: skip
     """Return the matching costs of all pixels and levels.
 
@@ -38,6 +39,8 @@ def cost_volume(
         Levels ``min_disparity <= d < max_disparity``, pixels.
     outside : float or None
         Cost of matches outside the right image as a share of the cost's range; None takes the border pixel.
+    smooth : float
+        Sigma in pixels of a Gaussian on both images before matching.
     threads : int or None
         Threads; None uses the processors at hand.
     **options
@@ -58,7 +61,7 @@ def cost_volume(
     levels = Levels(low, check_integer("max_disparity", max_disparity, low + 1) - low)
     count = available_threads() if threads is None else check_integer("threads", threads, 1)
     share = None if outside is None else check_number("outside", outside, 0, 1)
-    gray = gray_pair(left, right)
+    gray = smoothed(gray_pair(left, right), check_number("smooth", smooth, 0, 10))
     pair = Pair(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
     return produce_volume(stage.prepare(pair, Workspace(), count), gray.left.shape, levels, count)
 

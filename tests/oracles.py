@@ -91,9 +91,15 @@ def zncc(left, right, minimum, count, window=5, outside=1.0):
     return _volume(left, right, minimum, count, cost, outside, np.float64)
 
 
-def sgm(volume, p1, p2, directions):
-    """Sum over `directions` of the path costs (Hirschmueller 2008, eq. 13-14), in integers."""
+def sgm(volume, p1, p2, directions, guide=None, edge=0, edge_factor=1.0):
+    """Sum over `directions` of the path costs (Hirschmueller 2008, eq. 13-14), in integers.
+
+    Both penalties of a step between pixels whose values in `guide` differ by `edge` or more are multiplied by
+    `edge_factor` and rounded.
+    """
     height, width, count = volume.shape
+    flat = p1, p2
+    crossing = round(p1 * edge_factor), round(p2 * edge_factor)
     total = np.zeros(volume.shape, np.int64)
     for dy, dx in directions:
         path = np.zeros(volume.shape, np.int64)
@@ -104,6 +110,8 @@ def sgm(volume, p1, p2, directions):
                 here = [int(c) for c in volume[y, x]]
                 if 0 <= y - dy < height and 0 <= x - dx < width:
                     before = [int(c) for c in path[y - dy, x - dx]]
+                    jump = 0 if guide is None else abs(int(guide[y, x]) - int(guide[y - dy, x - dx]))
+                    p1, p2 = crossing if guide is not None and jump >= edge else flat
                     least = min(before)
                     for d in range(count):
                         best = min(before[d], least + p2)
@@ -117,16 +125,21 @@ def sgm(volume, p1, p2, directions):
     return total
 
 
-def domain_transform(plane, guide, sigma_s, sigma_r, passes):
-    """Recursive filter of one slice, ``(H, W)``, float64 (Gastal and Oliveira 2011, eq. 14 and 21)."""
+def domain_transform(plane, guide, sigma_s, sigma_r, passes, sigma_v=None):
+    """Recursive filter of one slice, ``(H, W)``, float64 (Gastal and Oliveira 2011, eq. 14 and 21).
+
+    `sigma_v` is the spatial scale along columns where it differs from that along rows.
+    """
     values = np.array(plane, np.float64)
     grey = np.array(guide, np.float64)
+    along_columns = sigma_s if sigma_v is None else sigma_v
     for i in range(1, passes + 1):
-        sigma = sigma_s * math.sqrt(3) * 2.0 ** (passes - i) / math.sqrt(4.0**passes - 1)
-        a = math.exp(-math.sqrt(2) / sigma)
-        for image, edges in ((values, grey), (values.T, grey.T)):  # views: rows, then columns
+        # Views: rows, then columns.
+        for image, edges, scale in ((values, grey, sigma_s), (values.T, grey.T, along_columns)):
+            sigma = scale * math.sqrt(3) * 2.0 ** (passes - i) / math.sqrt(4.0**passes - 1)
+            a = math.exp(-math.sqrt(2) / sigma)
             for line, edge in zip(image, edges, strict=True):
-                weight = [a ** (1 + sigma_s / sigma_r * abs(edge[n] - edge[n - 1])) for n in range(1, len(line))]
+                weight = [a ** (1 + scale / sigma_r * abs(edge[n] - edge[n - 1])) for n in range(1, len(line))]
                 for n in range(1, len(line)):
                     line[n] += weight[n - 1] * (line[n - 1] - line[n])
                 for n in range(len(line) - 2, -1, -1):
@@ -238,6 +251,41 @@ def median(disparity, size):
             ]
             held = sorted(v for v in held if not math.isnan(v))
             out[y, x] = held[(len(held) - 1) // 2]
+    return out
+
+
+def remove_speckles(disparity, size, difference=1.0):
+    """Invalidate 4-connected regions of `size` pixels or fewer; neighbours differ by `difference` at most, in 1/16."""
+    height, width = disparity.shape
+    out = np.array(disparity, np.float64)
+    valid = [(y, x) for y in range(height) for x in range(width) if not math.isnan(disparity[y, x])]
+    fixed = {at: round(16 * float(disparity[at])) for at in valid}
+    while fixed:
+        region, edge = [], [next(iter(fixed))]
+        held = {edge[0]: fixed.pop(edge[0])}
+        while edge:
+            y, x = at = edge.pop()
+            region.append(at)
+            for near in ((y - 1, x), (y + 1, x), (y, x - 1), (y, x + 1)):
+                if near in fixed and abs(fixed[near] - held[at]) <= 16 * difference:
+                    held[near] = fixed.pop(near)
+                    edge.append(near)
+        if len(region) <= size:
+            for at in region:
+                out[at] = math.nan
+    return out
+
+
+def gaussian(image, sigma):
+    """Gaussian filter with replicated borders, cut at six sigma, float64."""
+    radius = math.ceil(6 * sigma)
+    taps = [math.exp(-(k * k) / (2 * sigma * sigma)) for k in range(-radius, radius + 1)]
+    out = np.array(image, np.float64)
+    for lines in (out, out.T):
+        for line in lines:
+            padded = [float(line[0])] * radius + [float(v) for v in line] + [float(line[-1])] * radius
+            for n in range(len(line)):
+                line[n] = sum(t * v for t, v in zip(taps, padded[n:], strict=False)) / sum(taps)
     return out
 
 

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereokit_evaluation._textures import Look
 
-__all__ = ["Camera", "Patch", "Plane", "covers", "occlusion", "plane_of", "rasterise"]
+__all__ = ["Camera", "Patch", "Plane", "covers", "occlusion", "plane_of", "rasterise", "texture_coordinates"]
 
 _NEAR_M = 0.2  # what is nearer than this to the camera plane is cut off
 _EPSILON_PX = 1e-6  # a surface must be nearer by more than this to occlude
@@ -241,13 +240,23 @@ def occlusion(planes: Sequence[Plane | None], disparity: Float) -> NDArray[np.bo
     return np.asarray(hidden)
 
 
-def coordinates(plane: Plane, x: Float, y: Float) -> dict[str, Any]:
-    """Return patch coordinates and their change per left pixel at view positions (n,), for the painter."""
+def texture_coordinates(plane: Plane, x: Float, y: Float) -> tuple[Float, Float, Float, Float]:
+    """Return where on the patch the view positions `x`, `y`, each (n,), lie.
+
+    Returns
+    -------
+    u, v, depth, step : (n,) float64
+        Place on the patch, distance Z, and how far one pixel of the left view reaches on the patch, metres. The
+        reach is that along a row, or half of that along a column: what is too fine along a column looks the
+        same in both views, so some of it may stay.
+    """
     inverse = _evaluate(plane.inverse_depth, x, y)
     depth = 1.0 / inverse
     u, v = _evaluate(plane.u, x, y) * depth, _evaluate(plane.v, x, y) * depth
-    steps = [
-        np.hypot((plane.u[k] - u * plane.inverse_depth[k]) * depth, (plane.v[k] - v * plane.inverse_depth[k]) * depth)
-        for k in (0, 1)
-    ]
-    return {"u": u, "v": v, "depth": depth, "step": np.maximum(steps[0], 0.5 * steps[1])}
+    per_left = 1.0 / plane.left_x[0]  # dx_view / dx_left
+    reach = []
+    for k, scale in ((0, per_left), (1, 0.5)):
+        du = (plane.u[k] - u * plane.inverse_depth[k]) * depth * scale
+        dv = (plane.v[k] - v * plane.inverse_depth[k]) * depth * scale
+        reach.append(np.sqrt(du * du + dv * dv))
+    return u, v, depth, np.maximum(reach[0], reach[1])

@@ -43,23 +43,25 @@ def _shade(colour: Colour, factor: float) -> Colour:
 
 def _blank(width_m: float, height_m: float, scale: float, colour: Colour) -> Bytes:
     shape = (max(8, round(height_m * scale)), max(8, round(width_m * scale)), 3)
-    return np.full(shape, colour, np.float64).astype(np.uint8)
+    return np.full(shape, np.asarray(colour, np.float64).astype(np.uint8), np.uint8)
 
 
 def _blotches(rng: Rng, image: Bytes, amount: float) -> Bytes:
     """Return `image` with band-limited brightness noise of several octaves, `amount` grey levels."""
-    height, width = image.shape[:2]
+    height, width = (max(2, size // 3) for size in image.shape[:2])
     total = np.zeros((height, width), np.float32)
     for cells, weight in ((4, 1.0), (12, 0.8), (36, 0.6), (90, 0.5)):
-        rows, columns = min(height, max(2, cells * height // max(width, 1) + 2)), min(width, cells + 2)
+        rows, columns = min(height, max(2, cells * height // width + 2)), min(width, cells + 2)
         noise = rng.standard_normal((rows, columns), np.float32)
-        total += weight * cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
-    return np.clip(image + (amount * total)[..., None], 0, 255).astype(np.uint8)
+        total += np.float32(amount * weight) * cv2.resize(noise, (width, height), interpolation=cv2.INTER_LINEAR)
+    total = cv2.resize(total, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.add(image, cv2.merge([total] * 3), dtype=cv2.CV_8U), np.uint8)
 
 
-def facade(rng: Rng, width_m: float, height_m: float, colour: Colour, *, bare: bool = False) -> Bytes:
-    """Return the front of a house; `bare` leaves the plaster empty (textureless)."""
-    scale = 40.0
+def facade(
+    rng: Rng, width_m: float, height_m: float, colour: Colour, *, bare: bool = False, scale: float = 40.0
+) -> Bytes:
+    """Return the front of a house, `scale` pixels per metre; `bare` leaves the plaster empty (textureless)."""
     image = _blank(width_m, height_m, scale, colour)
     if bare:
         _rectangle(image, scale, 0, height_m - 0.5, width_m, height_m, _shade(colour, 0.6))
@@ -160,19 +162,21 @@ def car_end(colour: Colour, *, front: bool) -> tuple[Bytes, Mask]:
     return image, mask > 0
 
 
-def car_side(colour: Colour) -> tuple[Bytes, Mask]:
-    """Return the side of an estate car, 4.3 x 1.55 m, rear at the left, and its outline."""
+def car_side(colour: Colour, *, van: bool) -> tuple[Bytes, Mask]:
+    """Return the side of an estate car, or of a van, 4.3 x 1.55 m, and its outline.
+
+    The estate car has its rear at the left, the van, upright at both ends, its front.
+    """
     scale, width, height = 80.0, 4.3, 1.55
     image = _blank(width, height, scale, colour)
     mask = np.zeros(image.shape[:2], np.uint8)
-    outline = [
-        (0.0, 0.72), (0.12, 0.06), (0.3, 0.0), (2.2, 0.0), (2.55, 0.1), (3.15, 0.62), (4.1, 0.76), (4.3, 0.95),
-        (4.3, 1.3), (0.0, 1.3),
-    ]  # fmt: skip
+    bonnet = [(3.9, 0.0), (4.18, 0.06), (4.28, 0.6)] if van else [(2.2, 0.0), (2.55, 0.1), (3.15, 0.62), (4.1, 0.76)]
+    pane = [(4.0, 0.12), (4.1, 0.62)] if van else [(2.2, 0.12), (2.45, 0.2), (2.95, 0.62)]
+    outline = [(0.0, 0.72), (0.12, 0.06), (0.3, 0.0), *bonnet, (4.3, 0.95), (4.3, 1.3), (0.0, 1.3)]
     _polygon(mask, scale, outline, 1)
-    _polygon(image, scale, [(0.3, 0.62), (0.4, 0.12), (2.2, 0.12), (2.45, 0.2), (2.95, 0.62)], _GLASS)
+    _polygon(image, scale, [(0.3, 0.62), (0.4, 0.12), *pane], _GLASS)
     _polygon(image, scale, [(0.6, 0.62), (0.9, 0.12), (1.1, 0.12), (0.8, 0.62)], _shade(_GLASS, 1.7))
-    for u in (1.02, 1.98):
+    for u in (1.02, 1.98, 2.95):
         _rectangle(image, scale, u, 0.1, u + 0.09, 0.64, colour)
     for u in (1.06, 2.02, 3.1):
         _rectangle(image, scale, u, 0.64, u + 0.02, 1.24, _shade(colour, 0.55))
@@ -180,8 +184,9 @@ def car_side(colour: Colour) -> tuple[Bytes, Mask]:
         _rectangle(image, scale, u, 0.74, u + 0.2, 0.78, _shade(colour, 0.5))
     _rectangle(image, scale, 0, 0.68, 4.2, 0.7, _shade(colour, 1.3))
     _rectangle(image, scale, 0, 1.2, width, height, _DARK)
-    _rectangle(image, scale, 0, 0.74, 0.16, 0.96, (178, 26, 30))
-    _rectangle(image, scale, 4.1, 0.84, 4.3, 0.98, (236, 234, 218))
+    lamps: list[Colour] = [(178, 26, 30), (236, 234, 218)]
+    for u, lamp in ((0.0, lamps[van]), (4.12, lamps[not van])):
+        _rectangle(image, scale, u, 0.8, u + 0.18, 0.98, lamp)
     for u in (0.85, 3.45):
         centre = (round(u * scale), round(1.23 * scale))
         cv2.circle(image, centre, round(0.37 * scale), _DARK, -1)
@@ -192,9 +197,8 @@ def car_side(colour: Colour) -> tuple[Bytes, Mask]:
     return image, mask > 0
 
 
-def tree(rng: Rng, width_m: float, height_m: float, hue: Colour) -> tuple[Bytes, Mask]:
+def tree(rng: Rng, width_m: float, height_m: float, hue: Colour, *, scale: float = 44.0) -> tuple[Bytes, Mask]:
     """Return a street tree, its trunk on the middle of the lower edge, and its outline."""
-    scale = 44.0
     image = _blank(width_m, height_m, scale, (62, 52, 42))
     mask = np.zeros(image.shape[:2], np.uint8)
     middle, crown = width_m / 2, height_m * 0.36
@@ -203,14 +207,14 @@ def tree(rng: Rng, width_m: float, height_m: float, hue: Colour) -> tuple[Bytes,
     for _ in range(7):
         end = (middle + rng.uniform(-0.34, 0.34) * width_m, rng.uniform(0.12, 0.4) * height_m)
         start = (round(middle * scale), round(0.66 * height_m * scale))
-        cv2.line(mask, start, (round(end[0] * scale), round(end[1] * scale)), 1, 3)
+        cv2.line(mask, start, (round(end[0] * scale), round(end[1] * scale)), 1, max(1, round(scale / 15)))
     count = 330
     angle, radius = rng.uniform(0, 2 * np.pi, count), np.sqrt(rng.uniform(0, 1, count))
     u = middle + np.cos(angle) * radius * width_m * 0.41
     v = crown + np.sin(angle) * radius * height_m * 0.29
     for k in np.argsort(-v):  # the lit upper leaves last
         size = rng.uniform(0.12, 0.34)
-        light = float(np.clip(1.25 - 0.75 * v[k] / (0.72 * height_m) + rng.normal(0, 0.14), 0.3, 1.6))
+        light = min(1.6, max(0.3, 1.25 - 0.75 * v[k] / (0.72 * height_m) + rng.normal(0, 0.14)))
         axes = (round(size * scale), round(size * scale * rng.uniform(0.5, 1.0)))
         centre = (round(u[k] * scale), round(v[k] * scale))
         turn = float(rng.uniform(0, 180))
@@ -278,7 +282,7 @@ def ground(rng: Rng, half_width_m: float, depth_m: float, kerb_m: float, cars: l
 
     `cars` are (X, Z of the near end), metres.
     """
-    scale = 36.0
+    scale = 30.0
     image = _blank(2 * half_width_m, depth_m, scale, (104, 104, 108))
 
     def strip(x0: float, x1: float, z0: float, z1: float, colour: Colour) -> None:

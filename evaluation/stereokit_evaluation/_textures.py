@@ -119,18 +119,19 @@ class Decal:
     Attributes
     ----------
     kind : {"textureless", "specular", "brightness"}
-        A flat colour with a weak gradient; a highlight that lies at `disparity` instead of the patch's; a
-        change of brightness in the right view only.
+        A flat colour with a weak gradient; a highlight that each view sees in another place;
+        a change of brightness in the right view only, soft over 0.4 m at its edges.
     u0, v0, u1, v1 : float
         Where it is, metres on the patch.
     colour : tuple of 3 float
         The flat colour, or the highlight's.
     gain, offset : float
         What the right view's brightness is multiplied by, then raised by, for ``"brightness"``.
-    x, y, radius : float
-        Centre of the highlight in the left image and its reach, pixels.
-    disparity : float
-        Disparity of the highlight, pixels: a mirror image lies behind its mirror, so less than the patch's.
+    u, v, radius_u, radius_v : float
+        Centre and reach of the highlight on the patch in the left view, metres.
+    shift_u : float
+        How far along `u` the right view sees it from there, metres. The image of a distant lamp in a mirror
+        that faces the camera moves by the whole baseline.
     """
 
     kind: Literal["textureless", "specular", "brightness"]
@@ -141,18 +142,20 @@ class Decal:
     colour: Colour = (255.0, 255.0, 255.0)
     gain: float = 1.0
     offset: float = 0.0
-    x: float = 0.0
-    y: float = 0.0
-    radius: float = 1.0
-    disparity: float = 0.0
+    u: float = 0.0
+    v: float = 0.0
+    radius_u: float = 1.0
+    radius_v: float = 1.0
+    shift_u: float = 0.0
 
     def inside(self, u: Float, v: Float) -> NDArray[np.bool_]:
         """Return which points of the patch it covers."""
         return np.asarray((u >= self.u0) & (u < self.u1) & (v >= self.v0) & (v < self.v1))
 
-    def highlight(self, x: Float, y: Float) -> Float32:
-        """Return the strength in [0, 1] of the highlight at left-image positions."""
-        reach = ((x - self.x) / self.radius) ** 2 + ((y - self.y) / (1.6 * self.radius)) ** 2
+    def highlight(self, u: Float, v: Float, *, right: bool) -> Float32:
+        """Return the strength in [0, 1] of the highlight at points of the patch, as one view sees it."""
+        centre = self.u + (self.shift_u if right else 0.0)
+        reach = ((u - centre) / self.radius_u) ** 2 + ((v - self.v) / self.radius_v) ** 2
         return np.exp(-reach).astype(np.float32)
 
 
@@ -185,7 +188,7 @@ class Look:
 
 
 def paint(
-    look: Look, u: Float, v: Float, depth: Float, step: Float, x: Float, y: Float, *, right: bool
+    look: Look, u: Float, v: Float, depth: Float, step: Float, *, right: bool
 ) -> Float32:
     """Return the colours of n points of a patch, (n, 3) float32, about 0..255.
 
@@ -195,8 +198,6 @@ def paint(
         The patch's paint.
     u, v, depth, step : (n,) float64
         Place on the patch, distance, and reach of a pixel, metres.
-    x, y : (n,) float64
-        Position in this view, pixels.
     right : bool
         Which view.
     """
@@ -218,8 +219,10 @@ def paint(
     colour += air * (np.array([196, 208, 222], np.float32) - colour)
     for decal in look.decals:
         if decal.kind == "specular" and (inside := decal.inside(u, v)).any():
-            seen = decal.highlight((x + decal.disparity if right else x)[inside], y[inside])
+            seen = decal.highlight(u[inside], v[inside], right=right)
             colour[inside] += seen[:, None] * np.asarray(decal.colour, np.float32)
         elif decal.kind == "brightness" and right and (inside := decal.inside(u, v)).any():
-            colour[inside] = colour[inside] * np.float32(decal.gain) + np.float32(decal.offset)
+            edge = np.minimum.reduce([u - decal.u0, decal.u1 - u, v - decal.v0, decal.v1 - v])[inside]
+            share = np.minimum(edge / 0.4, 1.0).astype(np.float32)[:, None]
+            colour[inside] += share * (colour[inside] * np.float32(decal.gain - 1) + np.float32(decal.offset))
     return np.asarray(colour, np.float32)

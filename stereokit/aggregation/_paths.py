@@ -110,8 +110,8 @@ def _horizontals(buffers: PathBuffers) -> None:
     for block in range(0, 2 * padded, LANES):
         store(chains, block, zero)
     like = buffers.across[0]
-    least_a = np.uint8(0)
-    least_b = np.uint8(0)
+    low_a = zero
+    low_b = zero
     for x in range(width):
         xb = width - 1 - x
         behind = min(xb + 1, width - 1)  # the step into xb from the right has the jump between xb and xb + 1
@@ -119,8 +119,6 @@ def _horizontals(buffers: PathBuffers) -> None:
         p2_a = splat(buffers.penalties[7 * width + x])
         p1_b = splat(buffers.penalties[6 * width + behind])
         p2_b = splat(buffers.penalties[7 * width + behind])
-        low_a = splat(least_a)
-        low_b = splat(least_b)
         smallest_a = full
         smallest_b = full
         below_a = full
@@ -159,8 +157,8 @@ def _horizontals(buffers: PathBuffers) -> None:
             below_b = here_b
             here_a = above_a
             here_b = above_b
-        least_a = lowest(smallest_a)
-        least_b = lowest(smallest_b)
+        low_a = splat(lowest(smallest_a))
+        low_b = splat(lowest(smallest_b))
 
 
 @inline

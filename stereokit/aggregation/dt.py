@@ -338,9 +338,10 @@ def _filter_band(
                 at = (x - x0) * padded + n * LANES
                 store(state, at, _feed_back(load(column, y * size + at), load(state, at), weight, keep))
             if last:
-                select_pixel(keys, state, (x - x0) * padded, padded, y * width + x, out)
+                select_pixel(keys, state, (x - x0) * padded, blocks, y * width + x, out)
         if not last:
             for at in range(0, size, LANES):
                 _pack(costs, base + at, load(state, at), weights.shift)
         elif total.size > 0:
-            total[base : base + size] = state[:size]
+            for at in range(0, size, LANES):
+                store(total, base + at, load(state, at))

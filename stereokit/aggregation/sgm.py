@@ -23,7 +23,7 @@ from stereokit.errors import OptionError
 from stereokit.inputs import check_number
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.pool import run
-from stereokit.kernels.simd import LANES
+from stereokit.kernels.simd import LANES, load, store
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, select_row
@@ -176,5 +176,6 @@ def _last_visit(
     for y in range(y0, y1, step):
         last_visit_row(rows, buffers, guide, p1, p2, y, step, k0 + (y - y0) * step, sums, stored)
         if total.size > 0:
-            total[y * size : (y + 1) * size] = buffers.total
-        select_row(buffers.total, buffers.total, buffers.width, padded, y * buffers.width, out)
+            for at in range(0, size, LANES):
+                store(total, y * size + at, load(buffers.total, at))
+        select_row(buffers.total, buffers.total, buffers.width, buffers.blocks, y * buffers.width, out)

@@ -107,12 +107,17 @@ class Zncc:
         right_sum = workspace.array("zncc.right_sum", (height, right_width), np.int32)
         right_scale = workspace.array("zncc.right_scale", (height, right_width), np.float32)
         tasks: list[Any] = []
-        for y0, y1 in spans(height, pair.threads):
+        for k, (y0, y1) in enumerate(spans(height, pair.threads)):
+            work = workspace.array(f"zncc.work{k}", (2, 2, right_width + 2 * half), np.int64)
             tasks.append(
-                lambda y0=y0, y1=y1: _statistics(left, y0, y1, self.window, self.steps, left_sum, left_scale)
+                lambda y0=y0, y1=y1, work=work: _statistics(
+                    left, y0, y1, self.window, self.steps, work[0], left_sum, left_scale
+                )
             )
             tasks.append(
-                lambda y0=y0, y1=y1: _statistics(right, y0, y1, self.window, 1, right_sum, right_scale)
+                lambda y0=y0, y1=y1, work=work: _statistics(
+                    right, y0, y1, self.window, 1, work[1], right_sum, right_scale
+                )
             )
         run(tasks, pair.threads)
         cells = cells_of(pair, self.cost_max, workspace)
@@ -141,13 +146,15 @@ class Zncc:
 
 @kernel
 def _statistics(
-    image: NDArray[Any], y0: int, y1: int, window: int, scale: int, out_sum: NDArray[np.int32],
-    out_scale: NDArray[np.float32],
+    image: NDArray[Any], y0: int, y1: int, window: int, scale: int, work: NDArray[np.int64],
+    out_sum: NDArray[np.int32], out_scale: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Window sums and scale / sqrt(variance) of rows y0..y1; columns beyond the output's width are not read."""
     width = out_sum.shape[1]
-    sums = np.zeros(width + window - 1, np.int64)
-    squares = np.zeros(width + window - 1, np.int64)
+    sums = work[0, : width + window - 1]
+    squares = work[1, : width + window - 1]
+    sums[:] = 0
+    squares[:] = 0
     for y in range(y0, y1):
         if y == y0:
             for row in range(y, y + window):

@@ -35,14 +35,19 @@ def _fingerprint() -> str:
 _FINGERPRINT = _fingerprint()
 
 
+# Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
+# a pixel; for the same reason kernels cannot allocate: buffers come in as arguments.
+_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+
+
 def kernel(function: F) -> F:
     """Compile `function` as a kernel that Python code calls."""
     function.__qualname__ = f"{function.__qualname__}_{_FINGERPRINT}"
-    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    compiled: F = numba.njit(cache=True, **_FLAGS)(function)
     return compiled
 
 
 def inline(function: F) -> F:
     """Compile `function` as a helper that kernels call and that is always inlined into them."""
-    compiled: F = numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
+    compiled: F = numba.njit(forceinline=True, **_FLAGS)(function)
     return compiled

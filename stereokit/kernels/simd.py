@@ -31,6 +31,7 @@ __all__ = [
     "add",
     "add_saturated",
     "aligned",
+    "choose",
     "convert",
     "count_bits",
     "either",
@@ -378,13 +379,23 @@ def mask_equal(typing: Any, a: Any, b: Any) -> Any:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def first_bit(typing: Any, mask: Any) -> Any:
-    """Return the position of the lowest set bit of a ``uint64`` that is not 0."""
+    """Return the position of the lowest set bit of a ``uint64``, 64 if there is none."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        flag = ir.Constant(ir.IntType(1), 1)
+        flag = ir.Constant(ir.IntType(1), 0)
         return _call(builder, "llvm.cttz.i64", ir.IntType(64), [args[0], flag])
 
     return types.int64(types.uint64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def choose(typing: Any, condition: Any, a: Any, b: Any) -> Any:
+    """Return a if `condition` else b, both ``int64``, without a branch."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.select(args[0], args[1], args[2])
+
+    return types.int64(types.boolean, types.int64, types.int64), generate
 
 
 def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray[Any, Any]:

@@ -44,14 +44,13 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
     if not np.isnan(source).any():
         return np.asarray(cv2.medianBlur(source, size), np.float32).reshape(source.shape)
     out = np.empty_like(source)
-    _median_of_valid(source, size // 2, out)
+    _median_of_valid(source, size // 2, np.empty(size * size, np.float32), out)
     return out
 
 
 @kernel
-def _median_of_valid(source: NDArray[np.float32], half: int, out: NDArray[np.float32]) -> None:
+def _median_of_valid(source: NDArray[np.float32], half: int, held: NDArray[np.float32], out: NDArray[np.float32]) -> None:
     height, width = source.shape
-    held = np.empty((2 * half + 1) ** 2, np.float32)
     for y in range(height):
         for x in range(width):
             if np.isnan(source[y, x]):

@@ -47,14 +47,15 @@ def single_matching_phase(
     out = np.array(disparity, np.float32, order="C")
     cost = np.ascontiguousarray(cost)
     parts = spans(out.shape[0], threads)
-    run([lambda y0=y0, y1=y1: _resolve(out, cost, y0, y1) for y0, y1 in parts], threads)  # type: ignore[misc]
+    owners = np.empty((len(parts), out.shape[1]), np.int64)
+    tasks = [lambda k=k, y=y: _resolve(out, cost, *y, owners[k]) for k, y in enumerate(parts)]  # type: ignore[misc]
+    run(tasks, threads)
     return out
 
 
 @kernel
-def _resolve(disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int) -> None:
+def _resolve(disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int, owner: NDArray[np.int64]) -> None:
     width = disparity.shape[1]
-    owner = np.empty(width, np.int64)
     for y in range(y0, y1):
         row = disparity[y]
         owner[:] = -1

@@ -1,36 +1,42 @@
 """Removal of speckles: small islands of disparity that agree with nothing around them (Hirschmueller 2008, III-B).
 
-A region is a set of neighbours (4-connected) whose disparities differ by at most one pixel from one to the next;
-regions of few pixels become invalid. This is OpenCV's ``filterSpeckles`` on disparities in sixteenths of a pixel.
+A region is a set of 4-connected pixels whose disparities differ by at most `difference` from one to the next;
+regions of few pixels become invalid. Regions are found by union-find over the runs of each row (He, Chao, Suzuki
+2008): one pass in bands that are joined at their seams, one pass that erases. The rule is that of OpenCV's
+``filterSpeckles``, but on disparities as they are, not in sixteenths, and several times faster.
 """
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
 from stereokit.inputs import check_integer, check_number
+from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.pool import run, spans
+from stereokit.kernels.workspace import Workspace
 
 __all__ = ["remove_speckles"]
 
-_SCALE = 16
-
 
 def remove_speckles(
-    disparity: NDArray[np.float32], size: int, difference: float = 1.0
-) -> NDArray[np.float32]:
+    disparity: NDArray[np.float32], size: int, difference: float = 1.0, *, threads: int = 1,
+    workspace: Workspace | None = None,
+) -> NDArray[np.float32]:  # fmt: skip
     """Return a copy of the map without regions of `size` pixels or fewer.
 
     Parameters
     ----------
     disparity : (H, W) float32, pixels, NaN where invalid
-        Between -2000 and 2000.
     size : int
         Largest region that is removed, pixels.
     difference : float
-        How much neighbours of one region differ at most, pixels, in sixteenths.
+        How much neighbours of one region differ at most, pixels.
+    threads : int
+        Threads to use; the result does not depend on it.
+    workspace : Workspace or None
+        Where buffers are kept between calls.
 
     Returns
     -------
@@ -44,12 +50,109 @@ def remove_speckles(
     if disparity.ndim != 2:
         raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
     size = check_integer("size", size, 0)
-    difference = check_number("difference", difference, 0, 1000)
-    invalid = np.isnan(disparity)
-    fixed = np.where(invalid, 0, np.rint(disparity * np.float32(_SCALE))).astype(np.int16)
-    mark = -32768
-    fixed[invalid] = mark
-    cv2.filterSpeckles(fixed, mark, size, difference * _SCALE)
-    out = np.array(disparity, np.float32)
-    out[fixed == mark] = np.nan
+    limit = np.float32(check_number("difference", difference, 0, 1e6))
+    out = np.array(disparity, np.float32, order="C")
+    held = workspace or Workspace()
+    label, parent, count = (
+        held.array(f"speckle.{name}", out.size, np.int32) for name in ("label", "parent", "count")
+    )
+    width = out.shape[1]
+    parts = spans(out.shape[0], threads)
+    run([lambda y=y: _find_regions(out, *y, limit, label, parent, count) for y in parts], threads)  # type: ignore[misc]
+    for y0, _ in parts[1:]:
+        _join_rows(out, y0, limit, label, parent, count)
+    flat = out.reshape(-1)
+    tasks = [lambda y=y: _erase(flat, y[0] * width, y[1] * width, size, label, parent, count) for y in parts]  # type: ignore[misc]
+    run(tasks, threads)
     return out
+
+
+@inline
+def _unite(parent: NDArray[np.int32], count: NDArray[np.int32], a: int, b: int) -> None:
+    """Join two regions under the older one, which then holds the pixels of both."""
+    while parent[a] != a:
+        parent[a] = parent[parent[a]]
+        a = np.int64(parent[a])
+    while parent[b] != b:
+        parent[b] = parent[parent[b]]
+        b = np.int64(parent[b])
+    if a != b:
+        first = min(a, b)
+        second = max(a, b)
+        parent[second] = first
+        count[first] += count[second]
+
+
+@kernel
+def _find_regions(
+    disparity: NDArray[np.float32], y0: int, y1: int, limit: np.float32, label: NDArray[np.int32],
+    parent: NDArray[np.int32], count: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Label the runs of rows y0..y1 and join those that touch; labels start at the first pixel's index."""
+    width = disparity.shape[1]
+    fresh = y0 * width
+    for y in range(y0, y1):
+        row = disparity[y]
+        before = disparity[max(y - 1, y0)]
+        base = y * width
+        x = 0
+        while x < width:
+            if np.isnan(row[x]):
+                label[base + x] = -1
+                x += 1
+                continue
+            mine = np.int64(fresh)
+            fresh += 1
+            parent[mine] = np.int32(mine)
+            count[mine] = 0
+            start = x
+            joined = np.int64(-1)  # the label above that this run was last joined to
+            while True:
+                label[base + x] = np.int32(mine)
+                if y > y0 and abs(row[x] - before[x]) <= limit:
+                    other = np.int64(label[base - width + x])
+                    if other != joined:
+                        _unite(parent, count, mine, other)
+                        joined = other
+                x += 1
+                if x >= width or not abs(row[x] - row[x - 1]) <= limit:
+                    break
+            root = mine
+            while parent[root] != root:
+                root = np.int64(parent[root])
+            count[root] += np.int32(x - start)
+
+
+@kernel
+def _join_rows(
+    disparity: NDArray[np.float32], y: int, limit: np.float32, label: NDArray[np.int32],
+    parent: NDArray[np.int32], count: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Join the regions of row `y` with those of the row above."""
+    width = disparity.shape[1]
+    for x in range(width):
+        if abs(disparity[y, x] - disparity[y - 1, x]) <= limit:
+            at = y * width + x
+            _unite(parent, count, np.int64(label[at]), np.int64(label[at - width]))
+
+
+@kernel
+def _erase(
+    disparity: NDArray[np.float32], start: int, stop: int, size: int, label: NDArray[np.int32],
+    parent: NDArray[np.int32], count: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Invalidate the pixels of small regions; flat range start..stop."""
+    last = np.int32(-1)
+    small = False
+    for at in range(start, stop):
+        mine = label[at]
+        if mine < 0:
+            continue
+        if mine != last:
+            root = np.int64(mine)
+            while parent[root] != root:
+                root = np.int64(parent[root])
+            small = count[root] <= size
+            last = mine
+        if small:
+            disparity[at] = np.nan

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, OptionError
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.simd import LANES, first_bit, load, lowest, mask_equal, minimum, splat
+from stereokit.kernels.simd import LANES, choose, first_bit, load, lowest, mask_equal, minimum, splat
 
 __all__ = ["Winners", "Wta", "select", "select_row", "winners_like"]
 
@@ -50,29 +50,28 @@ class Wta:
 
 
 @inline
-def _best_level(keys: NDArray[Any], at: int, padded: int) -> tuple[Any, int]:
+def _best_level(keys: NDArray[Any], at: int, blocks: tuple[int, ...]) -> tuple[Any, int]:
     """The smallest key of the levels from `at` on, and the first level that has it."""
     smallest = load(keys, at)
-    for block in range(LANES, padded, LANES):
-        smallest = minimum(smallest, load(keys, at + block))
+    for n in range(1, len(blocks)):
+        smallest = minimum(smallest, load(keys, at + n * LANES))
     value = lowest(smallest)
     wanted = splat(value)
     level = np.int64(0)
-    for back in range(0, padded, LANES):
-        block = padded - LANES - back
-        mask = mask_equal(load(keys, at + block), wanted)
-        if mask != np.uint64(0):
-            level = block + first_bit(mask)
+    for back in range(len(blocks)):
+        block = (len(blocks) - 1 - back) * LANES
+        first = first_bit(mask_equal(load(keys, at + block), wanted))
+        level = choose(first < 64, block + first, level)
     return value, level
 
 
 @inline
-def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int, to: int, out: Winners) -> None:
+def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], to: int, out: Winners) -> None:
     """Write the winner among the levels from element `at` on to element `to` of the maps.
 
     `keys` are integers in the order of `values`: `values` itself, or the bits of non-negative floats.
     """
-    key, level = _best_level(keys, at, padded)
+    key, level = _best_level(keys, at, blocks)
     best = np.float32(values[at + level])
     disparity = np.float32(level + out.minimum)
     if out.subpixel and level > 0 and level < out.levels - 1:
@@ -84,7 +83,7 @@ def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int,
     out.disparity[to] = disparity
     out.cost[to] = values[at + level]
     if out.confidence.size > 0 or out.uniqueness > np.float32(0):
-        margin = _margin(keys, values, at, padded, level, out.levels)
+        margin = _margin(keys, values, at, blocks, level, out.levels)
         if out.confidence.size > 0:
             out.confidence[to] = margin
         if margin < out.uniqueness:
@@ -92,7 +91,7 @@ def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int,
 
 
 @inline
-def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int, level: int, levels: int) -> Any:
+def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], level: int, levels: int) -> Any:
     """``(c2 - c1) / c2`` with c2 the lowest cost that is not next to the winner's; 1 when there is no other."""
     first = max(level - 1, 0)
     behind_last = min(level + 2, levels)
@@ -104,7 +103,7 @@ def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int, leve
     keys[at + first] = most
     keys[at + level] = most
     keys[at + behind_last - 1] = most
-    _, other = _best_level(keys, at, padded)
+    _, other = _best_level(keys, at, blocks)
     rival = np.float32(values[at + other])
     keys[at + level] = held_1
     keys[at + first] = held_0
@@ -115,10 +114,12 @@ def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, padded: int, leve
 
 
 @kernel
-def select_row(keys: NDArray[Any], values: NDArray[Any], width: int, padded: int, to: int, out: Winners) -> None:
+def select_row(
+    keys: NDArray[Any], values: NDArray[Any], width: int, blocks: tuple[int, ...], to: int, out: Winners
+) -> None:
     """Select all pixels of one row of aggregated costs, ``(W, P)`` flat, into the maps from element `to` on."""
     for x in range(width):
-        select_pixel(keys, values, x * padded, padded, to + x, out)
+        select_pixel(keys, values, x * LANES * len(blocks), blocks, to + x, out)
 
 
 def winners_like(
@@ -168,11 +169,12 @@ def select(
     confidence = np.empty((height, width), np.float32)
     out = winners_like(disparity, cost, confidence, count, min_disparity, subpixel)
     worst = np.iinfo(volume.dtype).max if volume.dtype.kind in "iu" else np.finfo(volume.dtype).max
+    blocks = tuple(range(padded // LANES))
     row = np.full((width, padded), worst, volume.dtype)
     for y in range(height):
         row[:, :count] = volume[y]
         values = row.ravel()
-        select_row(keys_of(values), values, width, padded, y * width, out)
+        select_row(keys_of(values), values, width, blocks, y * width, out)
     return disparity, cost, confidence
 
 

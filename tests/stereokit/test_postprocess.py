@@ -7,7 +7,7 @@ import oracles
 import pytest
 
 from stereokit import InputError, OptionError, UnknownNameError
-from stereokit.postprocess import fill, median, single_matching_phase
+from stereokit.postprocess import fill, median, remove_speckles, single_matching_phase
 
 NAN = np.nan
 SHAPES = [(9, 14), (1, 12), (12, 1), (1, 1), (2, 3)]
@@ -96,10 +96,40 @@ def test_median_leaves_gaps_out():
     np.testing.assert_array_equal(np.isnan(out), np.isnan(disparity))
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("size", [0, 1, 4, 1000])
+@pytest.mark.parametrize("gaps", [0.0, 0.3, 1.0])
+def test_speckles(shape, size, gaps):
+    disparity = map_of(shape, 10, gaps, low=0, high=4)
+    kept = disparity.copy()
+    out = remove_speckles(disparity, size)
+    np.testing.assert_array_equal(out, oracles.remove_speckles(disparity, size))
+    np.testing.assert_array_equal(disparity, kept)
+    assert out.dtype == np.float32
+
+
+@pytest.mark.parametrize("difference", [0, 0.5, 2])
+@pytest.mark.parametrize("offset", [-1990, 1990])
+def test_speckles_by_difference_far_from_zero(difference, offset):
+    disparity = map_of((12, 20), 11, 0.1, low=0, high=4) + np.float32(offset)
+    out = remove_speckles(disparity, 3, difference)
+    np.testing.assert_array_equal(out, oracles.remove_speckles(disparity, 3, difference))
+
+
+def test_a_speckle_is_an_island_of_its_size():
+    disparity = np.full((5, 6), 9, np.float32)
+    disparity[1:3, 1:3] = 20
+    disparity[4, 5] = 9.5
+    np.testing.assert_array_equal(remove_speckles(disparity, 3), disparity)
+    expected = disparity.copy()
+    expected[1:3, 1:3] = NAN
+    np.testing.assert_array_equal(remove_speckles(disparity, 4), expected)
+
+
 @pytest.mark.parametrize("view", [np.s_[::-1], np.s_[:, ::-2], np.s_[1:, 1:]])
 def test_strided_maps(view):
     disparity, cost = map_of((9, 14), 7), np.random.default_rng(8).integers(0, 9, (9, 14), dtype=np.uint16)
-    for stage in (fill, median):
+    for stage in (fill, median, lambda d: remove_speckles(d, 2)):
         np.testing.assert_array_equal(stage(disparity[view]), stage(disparity[view].copy()))
     np.testing.assert_array_equal(
         single_matching_phase(disparity[view], cost[view]),
@@ -123,6 +153,9 @@ def test_maps_do_not_depend_on_threads(threads):
         (lambda: fill(np.zeros(3, np.float32)), InputError, ["disparity", "(3,)"]),
         (lambda: median(row(1), 4), OptionError, ["median", "3 or 5", "4"]),
         (lambda: median(np.zeros(3, np.float32)), InputError, ["disparity", "(3,)"]),
+        (lambda: remove_speckles(np.zeros(3, np.float32), 2), InputError, ["disparity", "(3,)"]),
+        (lambda: remove_speckles(row(1), -2), OptionError, ["size", "-2"]),
+        (lambda: remove_speckles(row(1), 2, -1), OptionError, ["difference", "-1"]),
         (lambda: single_matching_phase(row(1), np.zeros((1, 2), np.uint16)), InputError, ["cost", "(1, 2)"]),
     ],
 )

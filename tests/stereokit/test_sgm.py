@@ -24,9 +24,11 @@ def guide_of(shape, seed=0):
     return np.random.default_rng(seed + 100).integers(0, 256, shape, dtype=np.uint8)
 
 
-def sums(volume, largest, p1, p2, paths=8, **options):
+def sums(volume, largest, p1, p2, paths=8, edge_factor=1, **options):
+    """Aggregate, unless said otherwise along eight paths and with penalties that do not follow the image."""
     guide = guide_of(volume.shape[:2])
-    return aggregate(volume, guide, "sgm", cost=cost_of(largest), p1=p1, p2=p2, paths=paths, **options)
+    options = {"p1": p1, "p2": p2, "paths": paths, "edge_factor": edge_factor, **options}
+    return aggregate(volume, guide, "sgm", cost=cost_of(largest), **options)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -77,18 +79,38 @@ def test_512_levels():
     np.testing.assert_array_equal(sums(volume, 62, 7, 193), expected)
 
 
+@pytest.mark.parametrize("paths", [4, 5, 8])
+@pytest.mark.parametrize(("edge", "edge_factor"), [(8, 0.5), (100, 0.3), (0, 0.5), (128, 0), (256, 0.5), (1e6, 0)])
+def test_penalties_are_lower_across_edges_of_the_guide(paths, edge, edge_factor):
+    volume = volume_of((5, 6), 10, 62, seed=9)
+    guide = guide_of((5, 6), 9) // 2  # differences of 0 to 127
+    guide[:, :3] //= 16
+    options = {"p1": 21, "p2": 193, "edge": edge, "edge_factor": edge_factor, "paths": paths}
+    total = aggregate(volume, guide, "sgm", cost="census", **options)
+    expected = oracles.sgm(volume, 21, 193, oracles.DIRECTIONS[paths], guide, edge, edge_factor)
+    np.testing.assert_array_equal(total, expected)
+
+
+def test_penalties_left_out_fit_every_range():
+    for largest in (1, 30, 62, 127, 200, 254):
+        volume = volume_of((4, 5), 8, largest, seed=10)
+        total = aggregate(volume, guide_of((4, 5)), "sgm", cost=cost_of(largest), paths=8)
+        assert total.min() >= 0
+        assert total.max() <= 8 * 255
+
+
 def test_penalties_are_in_the_unit_of_the_cost():
-    volume = volume_of((5, 6), 8, 63, seed=5)
     guide = guide_of((5, 6))
-    expected = oracles.sgm(volume, round(0.3 * 63), round(2 * 63), oracles.DIRECTIONS[8])
-    for cost in ("zncc", Zncc(steps=63)):
-        total = aggregate(volume, guide, "sgm", cost=cost, p1=0.3, p2=2)
+    for cost, steps in ((Zncc(steps=63), 63), (Zncc(steps=20), 20), ("zncc", Zncc().steps)):
+        volume = volume_of((5, 6), 8, steps, seed=5)
+        expected = oracles.sgm(volume, round(0.3 * steps), round(2 * steps), oracles.DIRECTIONS[8])
+        total = aggregate(volume, guide, "sgm", cost=cost, p1=0.3, p2=2, paths=8, edge_factor=1)
         np.testing.assert_array_equal(total, expected)
 
 
 def test_census_penalties_are_neighbours_that_differ():
     volume = volume_of((4, 5), 6, 62, seed=6)
-    total = aggregate(volume, guide_of((4, 5)), "sgm", cost="census", p1=6, p2=96)
+    total = aggregate(volume, guide_of((4, 5)), "sgm", cost="census", p1=6, p2=96, paths=8, edge_factor=1)
     np.testing.assert_array_equal(total, oracles.sgm(volume, 6, 96, oracles.DIRECTIONS[8]))
 
 
@@ -120,6 +142,9 @@ def test_strided_volumes_and_guides_and_no_change_to_them():
         ({"p2": 194}, OptionError, ["p2", "193", "194"]),
         ({"p2": "much"}, OptionError, ["p2", "much"]),
         ({"paths": 3}, OptionError, ["paths", "4, 5 or 8", "3"]),
+        ({"edge": -1}, OptionError, ["edge", "-1"]),
+        ({"edge_factor": 1.5}, OptionError, ["edge_factor", "1.5"]),
+        ({"edge_factor": None}, OptionError, ["edge_factor", "None"]),
         ({"sigma_s": 3}, OptionError, ["sigma_s"]),
     ],
 )

@@ -1,0 +1,106 @@
+"""Threads: inside one call, and calls from many threads at once."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import stereokit
+from stereokit import Matcher, match
+
+METHODS = list(stereokit.METHODS.values())
+
+
+def pair_of(seed, shape=(37, 53)):
+    rng = np.random.default_rng(seed)
+    left = rng.integers(0, 256, shape, dtype=np.uint8)
+    noise = rng.integers(0, 20, shape, dtype=np.uint8)
+    return left, np.roll(left // 2 + noise, -4, axis=1)
+
+
+def assert_same(a, b):
+    np.testing.assert_array_equal(a.disparity, b.disparity)
+    np.testing.assert_array_equal(a.valid, b.valid)
+    np.testing.assert_array_equal(a.confidence, b.confidence)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("scale", [1, 0.5])
+def test_the_result_does_not_depend_on_threads(method, scale):
+    pair = pair_of(0)
+    one = Matcher(method, max_disparity=16, threads=1, confidence=True, scale=scale)(*pair)
+    for threads in (2, 3, 8, 100):
+        assert_same(one, Matcher(method, max_disparity=16, threads=threads, confidence=True, scale=scale)(*pair))
+
+
+@pytest.mark.parametrize("options", [{"paths": 4}, {"paths": 5}])
+def test_paths_do_not_depend_on_threads(options):
+    pair = pair_of(1)
+    one = Matcher("census+sgm", max_disparity=16, threads=1, confidence=True, **options)(*pair)
+    assert_same(one, Matcher("census+sgm", max_disparity=16, threads=2, confidence=True, **options)(*pair))
+
+
+@pytest.mark.parametrize("shape", [(1, 20), (2, 20), (3, 1)])
+def test_more_threads_than_rows(shape):
+    pair = pair_of(2, shape)
+    for method in METHODS:
+        one = Matcher(method, max_disparity=16, threads=1, confidence=True)(*pair)
+        assert_same(one, Matcher(method, max_disparity=16, threads=7, confidence=True)(*pair))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_eight_calls_at_once_on_one_matcher(method):
+    pairs = [pair_of(seed, (30 + seed % 3, 50)) for seed in range(8)]
+    matcher = Matcher(method, max_disparity=16, threads=2, confidence=True)
+    serial = [Matcher(method, max_disparity=16, threads=1, confidence=True)(*pair) for pair in pairs]
+    with ThreadPoolExecutor(8) as pool:
+        for _ in range(4):
+            for one, many in zip(serial, pool.map(lambda pair: matcher(*pair), pairs), strict=True):
+                assert_same(one, many)
+
+
+def test_eight_calls_at_once_on_different_matchers():
+    jobs = [(Matcher(METHODS[k % 4], max_disparity=16, confidence=True), pair_of(k)) for k in range(8)]
+    serial = [matcher(*pair) for matcher, pair in jobs]
+    with ThreadPoolExecutor(8) as pool:
+        for _ in range(4):
+            for one, many in zip(serial, pool.map(lambda job: job[0](*job[1]), jobs), strict=True):
+                assert_same(one, many)
+
+
+def test_eight_calls_of_match_at_once():
+    # More settings than `match` keeps matchers for, so that they are made and dropped meanwhile.
+    jobs = [(METHODS[k % 4], 12 + k // 4, pair_of(k)) for k in range(16)]
+
+    def run(job):
+        return match(*job[2], job[0], max_disparity=job[1])
+
+    serial = [run(job) for job in jobs]
+    with ThreadPoolExecutor(8) as pool:
+        for one, many in zip(serial * 3, pool.map(run, jobs * 3), strict=True):
+            np.testing.assert_array_equal(one, many)
+
+
+def test_an_error_leaves_the_matcher_usable():
+    matcher, pair = Matcher("census+sgm", max_disparity=16), pair_of(3)
+    expected = matcher(*pair).disparity
+    with pytest.raises(stereokit.InputError):
+        matcher(pair[0], pair[1][:5])
+    np.testing.assert_array_equal(matcher(*pair).disparity, expected)
+
+
+def test_a_forked_child_can_match(run_python, tmp_path):
+    script = tmp_path / "fork.py"
+    script.write_text(
+        "import multiprocessing, numpy, stereokit\n"
+        "left = numpy.arange(600, dtype=numpy.uint8).reshape(20, 30)\n"
+        "def work(_):\n"
+        "    return stereokit.match(left, left, 'census+sgm', max_disparity=16, threads=2).sum()\n"
+        "if __name__ == '__main__' and 'fork' in multiprocessing.get_all_start_methods():\n"
+        "    first = work(0)\n"
+        "    with multiprocessing.get_context('fork').Pool(2) as pool:\n"
+        "        assert pool.map_async(work, range(4)).get(timeout=60) == [first] * 4\n"
+    )
+    run_python(script, timeout=120)

@@ -307,9 +307,9 @@ def _plugin(entry: metadata.EntryPoint) -> Any:
 
         single = typer.Typer(add_completion=False, rich_markup_mode=None)
         anything = {"allow_extra_args": True, "ignore_unknown_options": True}
-        single.command(
-            entry.name, help=f"Not available: {reason}", context_settings=anything, add_help_option=False
-        )(unavailable)
+        single.command(entry.name, help=f"Not available: {reason}", context_settings=anything, add_help_option=False)(
+            unavailable
+        )
         command = typer.main.get_command(single)
     command.name = entry.name
     return command

@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, OptionError, did_you_mean
 
-__all__ = ["GrayPair", "check_flag", "check_integer", "check_names", "check_number", "gray_pair", "half_size", "smooth"]
+__all__ = [
+    "GrayPair",
+    "check_flag",
+    "check_integer",
+    "check_names",
+    "check_number",
+    "gray_pair",
+    "half_size",
+    "smooth",
+]
 
 _TYPES = (np.uint8, np.uint16, np.float32, np.float64)
 
@@ -94,7 +103,7 @@ def _gray(name: str, image: Any) -> NDArray[Any]:
 
 def _fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
     """Return `image` with bad pixels replaced by the nearest good one before them on the row, else behind."""
-    height, width = image.shape
+    width = image.shape[1]
     columns = np.where(bad, -1, np.arange(width))
     before = np.maximum.accumulate(columns, axis=1)
     columns = np.where(bad, width, np.arange(width))
@@ -164,7 +173,7 @@ def _guide(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint8]:
     low = min(int(left.min()), int(right.min()))
     high = max(int(left.max()), int(right.max()))
     scaled = (left.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1))
-    return np.rint(scaled).astype(np.uint8)
+    return np.asarray(np.rint(scaled), np.uint8)
 
 
 def smooth(pair: GrayPair, sigma: float) -> GrayPair:

@@ -6,8 +6,12 @@ at the same time. `match` is the one-line form.
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from typing import Any
 
@@ -20,7 +24,16 @@ from stereokit.aggregation import sgm as _sgm  # noqa: F401
 from stereokit.costs.rows import Levels, Pair
 from stereokit.defaults import DEFAULTS, METHODS
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean
-from stereokit.inputs import GrayPair, check_flag, check_integer, check_names, check_number, gray_pair, half_size, smooth
+from stereokit.inputs import (
+    GrayPair,
+    check_flag,
+    check_integer,
+    check_names,
+    check_number,
+    gray_pair,
+    half_size,
+    smooth,
+)
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.fill import FILLS, fill
@@ -34,7 +47,18 @@ from stereokit.selection.wta import winners_like
 __all__ = ["METHODS", "Matcher", "match", "parse_method", "warmup"]
 
 _MAX_LEVELS = 2048
-_PIPELINE = ("confidence", "fill", "median", "outside", "right", "smooth", "smp", "speckle", "subpixel", "uniqueness")
+_PIPELINE = (
+    "confidence",
+    "fill",
+    "median",
+    "outside",
+    "right",
+    "smooth",
+    "smp",
+    "speckle",
+    "subpixel",
+    "uniqueness",
+)
 
 
 def parse_method(method: str) -> str:
@@ -199,50 +223,92 @@ class Matcher:
         InputError
             If the images cannot be used.
         """
+        return self._call(left, right, self.threads)
+
+    def map(
+        self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None
+    ) -> Iterator[Disparity]:
+        """Match a sequence of pairs, several frames at a time, one thread each.
+
+        Frames in parallel use the processors better than threads within a frame, and any number of them. The
+        results are those of one call per pair, and come in the order of the pairs.
+
+        Parameters
+        ----------
+        pairs : iterable of (left, right)
+            Taken from one at a time, at most twice `threads` ahead of the result that was last handed out, so
+            that memory stays bounded however long the sequence is.
+        progress : callable or None
+            Called with the number of results so far, after each.
+
+        Yields
+        ------
+        Disparity
+
+        Raises
+        ------
+        InputError
+            When the turn comes of a pair that cannot be used.
+        """
+        ahead: deque[Future[Disparity]] = deque()
+        source = iter(pairs)
+        with ThreadPoolExecutor(self.threads, thread_name_prefix="stereokit-map") as executor:
+            try:
+                for done in itertools.count(1):
+                    for left, right in itertools.islice(source, 2 * self.threads - len(ahead)):
+                        ahead.append(executor.submit(self._call, left, right, 1))
+                    if not ahead:
+                        return
+                    yield ahead.popleft().result()
+                    if progress is not None:
+                        progress(done)
+            finally:
+                for waiting in ahead:
+                    waiting.cancel()
+
+    def _call(self, left: Any, right: Any, threads: int) -> Disparity:
         pair = gray_pair(left, right)
         with self._pool.take() as workspace:
-            full = self._match(pair, workspace)
+            full = self._match(pair, workspace, threads)
             if not self.right:
                 return full
-            mirrored = self._match(_mirror(pair), workspace)
+            mirrored = self._match(_mirror(pair), workspace, threads)
         other = np.ascontiguousarray(mirrored.disparity[:, ::-1])
         return Disparity(full.disparity, full.valid, full.confidence, other)
 
-    def _match(self, pair: GrayPair, workspace: Workspace) -> Disparity:
+    def _match(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
         if self._refine is None:
-            return self._match_levels(pair, self.min_disparity, self.max_disparity, workspace)
+            return self._match_levels(pair, self.min_disparity, self.max_disparity, workspace, threads)
         low, high = self.min_disparity // 2, -(-self.max_disparity // 2)
-        coarse = self._match_levels(half_size(pair), low, max(high, low + 1), workspace)
+        coarse = self._match_levels(half_size(pair), low, max(high, low + 1), workspace, threads)
         refined: Disparity = self._refine(coarse, pair.guide)
         return refined
 
-    def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace) -> Disparity:
+    def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace, threads: int) -> Disparity:
         levels = Levels(low, high - low)
         pair = smooth(pair, self.smooth)
         shape = pair.left.shape
         rows = self.cost.prepare(
-            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, self.threads),
+            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads),
             workspace,
-            max(2, self.threads),
+            max(2, threads),
         )
         disparity = np.empty(shape, np.float32)
         cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
         confidence = np.empty(shape, np.float32) if self.confidence else None
-        out = winners_like(
-            disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness
-        )
-        self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, self.threads, out)
+        out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness)
+        self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, threads, out)
         if pair.left_bad is not None:
             disparity[pair.left_bad] = np.nan
         if self.smp:
-            disparity = single_matching_phase(disparity, cost, threads=self.threads)
+            disparity = single_matching_phase(disparity, cost, threads=threads)
         if self.speckle:
             disparity = remove_speckles(
-                disparity, int(self.speckle * disparity.size), threads=self.threads, workspace=workspace
+                disparity, int(self.speckle * disparity.size), threads=threads, workspace=workspace
             )
         valid = ~np.isnan(disparity)
         if self.fill is not None:
-            disparity = fill(disparity, self.fill, threads=self.threads)
+            disparity = fill(disparity, self.fill, threads=threads)
         if self.median:
             disparity = median(disparity, self.median)
         if confidence is not None:

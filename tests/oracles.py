@@ -139,7 +139,9 @@ def domain_transform(plane, guide, sigma_s, sigma_r, passes, sigma_v=None):
             sigma = scale * math.sqrt(3) * 2.0 ** (passes - i) / math.sqrt(4.0**passes - 1)
             a = math.exp(-math.sqrt(2) / sigma)
             for line, edge in zip(image, edges, strict=True):
-                weight = [a ** (1 + scale / sigma_r * abs(edge[n] - edge[n - 1])) for n in range(1, len(line))]
+                weight = [
+                    a ** (1 + scale / sigma_r * abs(edge[n] - edge[n - 1])) for n in range(1, len(line))
+                ]
                 for n in range(1, len(line)):
                     line[n] += weight[n - 1] * (line[n - 1] - line[n])
                 for n in range(len(line) - 2, -1, -1):

@@ -1,12 +1,12 @@
 """Planar patches seen by a rectified stereo pair: exact disparity, visibility and occlusion in both views.
 
-A patch is a rectangle in space, optionally cut out by a bit mask. Seen from the left camera its disparity is
-``d(x, y) = a*x + b*y + c``, and its rectangle is four inequalities that are linear in ``x`` and ``y``. A right
-pixel ``x_r`` of the same patch satisfies ``x_r = x - d(x, y)``, so ``x = (x_r + b*y + c) / (1 - a)``, which is
-again linear. Both views are therefore drawn from the same functions, without warping one into the other, and
-the ground truth has no holes and no rounding but that of the number type.
+A patch is a rectangle in space, optionally cut out by a bit mask. Seen from the left camera its disparity
+is ``d(x, y) = a*x + b*y + c``, and its rectangle is four inequalities that are linear in ``x`` and ``y``. A
+right pixel ``x_r`` of the same patch satisfies ``x_r = x - d(x, y)``, so ``x = (x_r + b*y + c) / (1 - a)``,
+which is again linear. Both views are therefore drawn from the same functions, without warping one into the
+other, and the ground truth has no holes and no rounding but that of the number type.
 
-Axes: X right, Y down, Z forward, metres, the left camera at the origin. Pixel centres have integer coordinates.
+Axes: X right, Y down, Z forward, metres, the left camera at the origin. Pixel centres are whole numbers.
 """
 
 from __future__ import annotations
@@ -107,10 +107,9 @@ def _corners(patch: Patch) -> Float:
 
 
 def plane_of(patch: Patch, camera: Camera, *, right: bool = False) -> Plane | None:
-    """Return `patch` as the left or the right view sees it, None where that view sees its edge or back only.
+    """Return `patch` as the left or the right view sees it, None if it is invisible.
 
-    Raises nothing: a patch behind the camera, or one whose plane holds or separates the two camera centres,
-    is invisible.
+    That is a patch behind the camera, or one whose plane holds the left camera or separates the two.
     """
     corners = _corners(patch)
     if not len(corners):
@@ -127,7 +126,12 @@ def plane_of(patch: Patch, camera: Camera, *, right: bool = False) -> Plane | No
 
     inverse_depth = form(normal) / distance
     disparity = camera.focal * camera.baseline_m * inverse_depth
-    forms = [disparity, inverse_depth, form(u) - (u @ origin) * inverse_depth, form(v) - (v @ origin) * inverse_depth]
+    forms = [
+        disparity,
+        inverse_depth,
+        form(u) - (u @ origin) * inverse_depth,
+        form(v) - (v @ origin) * inverse_depth,
+    ]
     left_x = np.array([1.0, 0.0, 0.0])
     a, b, c = disparity
     if a >= 0.999:
@@ -246,9 +250,9 @@ def texture_coordinates(plane: Plane, x: Float, y: Float) -> tuple[Float, Float,
     Returns
     -------
     u, v, depth, step : (n,) float64
-        Place on the patch, distance Z, and how far one pixel of the left view reaches on the patch, metres. The
-        reach is that along a row, or half of that along a column: what is too fine along a column looks the
-        same in both views, so some of it may stay.
+        Place on the patch, distance Z, and how far one pixel of the left view reaches on the patch, metres.
+        The reach is that along a row, or half of that along a column: what is too fine along a column looks
+        the same in both views, so some of it may stay.
     """
     inverse = _evaluate(plane.inverse_depth, x, y)
     depth = 1.0 / inverse

@@ -1,6 +1,6 @@
-"""Painted pictures for the synthetic street: houses, cars, trees, people and the ground, each from a generator.
+"""Painted cut-outs for the synthetic street: cars, trees, people, signs, hedges; and the brush they share.
 
-They are plain drawings, fine enough that the photographs' grain on top gives a matcher what a street gives it.
+They are plain drawings; the photographs' grain on top gives a matcher what a street gives it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,21 @@ from numpy.typing import NDArray
 
 from stereokit_evaluation._textures import photograph
 
-__all__ = ["car_end", "car_side", "facade", "ground", "hedge", "person", "sign", "sky", "tree"]
+__all__ = [
+    "Colour",
+    "any_colour",
+    "blank",
+    "blotches",
+    "car_end",
+    "car_side",
+    "hedge",
+    "person",
+    "polygon",
+    "rectangle",
+    "shade",
+    "sign",
+    "tree",
+]
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -24,29 +38,35 @@ _GLASS: Colour = (46, 60, 74)
 _DARK: Colour = (26, 26, 29)
 
 
-def _rectangle(image: Bytes, scale: float, u0: float, v0: float, u1: float, v1: float, colour: Any) -> None:
+def rectangle(image: Bytes, scale: float, u0: float, v0: float, u1: float, v1: float, colour: Any) -> None:
     """Fill a rectangle given in metres, `scale` pixels each."""
     a, b = (round(u0 * scale), round(v0 * scale)), (round(u1 * scale) - 1, round(v1 * scale) - 1)
     if b[0] >= a[0] and b[1] >= a[1]:
         cv2.rectangle(image, a, b, tuple(float(c) for c in np.atleast_1d(colour)), -1)
 
 
-def _polygon(image: Bytes, scale: float, points: Any, colour: Any) -> None:
+def polygon(image: Bytes, scale: float, points: Any, colour: Any) -> None:
     corners = np.round(np.asarray(points, np.float64) * scale).astype(np.int32)
     cv2.fillPoly(image, [corners], tuple(float(c) for c in np.atleast_1d(colour)))
 
 
-def _shade(colour: Colour, factor: float) -> Colour:
+def any_colour(rng: Rng, low: float, high: float) -> Colour:
+    """Return a colour whose channels lie in [low, high)."""
+    r, g, b = rng.uniform(low, high, 3)
+    return float(r), float(g), float(b)
+
+
+def shade(colour: Colour, factor: float) -> Colour:
     r, g, b = (min(255.0, c * factor) for c in colour)
     return r, g, b
 
 
-def _blank(width_m: float, height_m: float, scale: float, colour: Colour) -> Bytes:
+def blank(width_m: float, height_m: float, scale: float, colour: Colour) -> Bytes:
     shape = (max(8, round(height_m * scale)), max(8, round(width_m * scale)), 3)
     return np.full(shape, np.asarray(colour, np.float64).astype(np.uint8), np.uint8)
 
 
-def _blotches(rng: Rng, image: Bytes, amount: float) -> Bytes:
+def blotches(rng: Rng, image: Bytes, amount: float) -> Bytes:
     """Return `image` with band-limited brightness noise of several octaves, `amount` grey levels."""
     height, width = (max(2, size // 3) for size in image.shape[:2])
     total = np.zeros((height, width), np.float32)
@@ -58,107 +78,49 @@ def _blotches(rng: Rng, image: Bytes, amount: float) -> Bytes:
     return np.asarray(cv2.add(image, cv2.merge([total] * 3), dtype=cv2.CV_8U), np.uint8)
 
 
-def facade(
-    rng: Rng, width_m: float, height_m: float, colour: Colour, *, bare: bool = False, scale: float = 40.0
-) -> Bytes:
-    """Return the front of a house, `scale` pixels per metre; `bare` leaves the plaster empty (textureless)."""
-    image = _blank(width_m, height_m, scale, colour)
-    if bare:
-        _rectangle(image, scale, 0, height_m - 0.5, width_m, height_m, _shade(colour, 0.6))
-        return image
-    trim = _shade(colour, float(rng.uniform(1.25, 1.5)))
-    storey, bay = float(rng.uniform(2.9, 3.4)), float(rng.uniform(2.1, 2.9))
-    bays = max(1, int(width_m / bay))
-    bay = width_m / bays
-    shutters: Colour = tuple(rng.uniform(50, 150, 3))  # type: ignore[assignment]
-    has_shutters = rng.random() < 0.4
-    ground_floor = height_m - storey
-    _rectangle(image, scale, 0, ground_floor, width_m, height_m, _shade(colour, 0.72))
-    top = ground_floor
-    while top > 0.3:
-        _rectangle(image, scale, 0, top - 0.12, width_m, top + 0.08, trim)
-        for k in range(bays):
-            u = (k + 0.5) * bay
-            v = top - storey + 0.75
-            _window(rng, image, scale, u, v, 1.15, 1.6, trim, shutters if has_shutters else None)
-        top -= storey
-    _rectangle(image, scale, 0, 0, width_m, 0.3, _shade(trim, 0.8))
-    door = int(rng.integers(bays))
-    for k in range(bays):
-        u = (k + 0.5) * bay
-        if k == door:
-            wood: Colour = tuple(rng.uniform(40, 120, 3))  # type: ignore[assignment]
-            _rectangle(image, scale, u - 0.7, height_m - 2.5, u + 0.7, height_m, trim)
-            _rectangle(image, scale, u - 0.55, height_m - 2.35, u + 0.55, height_m, wood)
-            for row in (2.1, 1.1):
-                for column in (-0.42, 0.06):
-                    _rectangle(
-                        image, scale, u + column, height_m - row, u + column + 0.36, height_m - row + 0.8,
-                        _shade(wood, 0.7),
-                    )  # fmt: skip
-        else:
-            _window(rng, image, scale, u, height_m - 2.3, 1.4, 1.5, trim, None)
-    _rectangle(image, scale, 0, height_m - 0.45, width_m, height_m, _shade(colour, 0.5))
-    return _blotches(rng, image, 5.0)
-
-
-def _window(
-    rng: Rng, image: Bytes, scale: float, u: float, v: float, width: float, height: float, trim: Colour,
-    shutters: Colour | None,
-) -> None:  # fmt: skip
-    """Draw a window whose top middle is at (u, v) metres."""
-    half = width / 2
-    _rectangle(image, scale, u - half - 0.12, v - 0.12, u + half + 0.12, v + height + 0.12, trim)
-    _rectangle(image, scale, u - half, v, u + half, v + height, _shade(_GLASS, float(rng.uniform(0.6, 1.5))))
-    curtain = _shade((178, 170, 158), float(rng.uniform(0.6, 1.1)))
-    kind = rng.integers(4)
-    if kind == 0:  # a roller blind, part of the way down
-        stop = v + height * float(rng.uniform(0.3, 1.0))
-        _rectangle(image, scale, u - half, v, u + half, stop, curtain)
-        for line in np.arange(v, stop, 0.12):
-            _rectangle(image, scale, u - half, line, u + half, line + 0.04, _shade(curtain, 0.75))
-    elif kind == 1:
-        _rectangle(image, scale, u - half, v, u - half + 0.3, v + height, curtain)
-        _rectangle(image, scale, u + half - 0.3, v, u + half, v + height, curtain)
-    elif kind == 2:  # the sky in the upper part of the pane
-        points = [(u - half, v), (u + half, v), (u + half, v + height * 0.25), (u - half, v + height * 0.65)]
-        _polygon(image, scale, points, (118, 138, 158))
-    frame: Colour = (214, 211, 204)
-    _rectangle(image, scale, u - 0.04, v, u + 0.04, v + height, frame)
-    _rectangle(image, scale, u - half, v + height * 0.4 - 0.03, u + half, v + height * 0.4 + 0.03, frame)
-    if shutters is not None:
-        for side in (-half - 0.55, half + 0.05):
-            _rectangle(image, scale, u + side, v, u + side + 0.5, v + height, shutters)
-            for line in np.arange(v + 0.08, v + height - 0.1, 0.16):
-                _rectangle(image, scale, u + side + 0.06, line, u + side + 0.44, line + 0.07, _shade(shutters, 0.7))
-
-
 def car_end(colour: Colour, *, front: bool) -> tuple[Bytes, Mask]:
     """Return the rear or the front of a car, 1.8 x 1.55 m, and its outline."""
     scale, width, height = 110.0, 1.8, 1.55
-    image = _blank(width, height, scale, colour)
+    image = blank(width, height, scale, colour)
     mask = np.zeros(image.shape[:2], np.uint8)
-    outline = [(0.02, 0.72), (0.22, 0.12), (0.4, 0.0), (1.4, 0.0), (1.58, 0.12), (1.78, 0.72), (1.8, 1.3), (0, 1.3)]
-    _polygon(mask, scale, outline, 1)
+    outline = [
+        (0.02, 0.72),
+        (0.22, 0.12),
+        (0.4, 0.0),
+        (1.4, 0.0),
+        (1.58, 0.12),
+        (1.78, 0.72),
+        (1.8, 1.3),
+        (0, 1.3),
+    ]
+    polygon(mask, scale, outline, 1)
     for u in (0.06, 1.5):
-        _rectangle(mask, scale, u, 1.2, u + 0.24, 1.55, 1)
-    _rectangle(image, scale, 0, 1.28, width, height, _DARK)
-    _polygon(image, scale, [(0.2, 0.66), (0.38, 0.12), (1.42, 0.12), (1.6, 0.66)], _GLASS)
-    _polygon(image, scale, [(0.75, 0.66), (1.0, 0.12), (1.2, 0.12), (0.95, 0.66)], _shade(_GLASS, 1.7))
-    _rectangle(image, scale, 0, 0.7, width, 0.73, _shade(colour, 0.55))
-    _rectangle(image, scale, 0, 1.08, width, 1.28, _shade(colour, 0.62))
+        rectangle(mask, scale, u, 1.2, u + 0.24, 1.55, 1)
+    rectangle(image, scale, 0, 1.28, width, height, _DARK)
+    polygon(image, scale, [(0.2, 0.66), (0.38, 0.12), (1.42, 0.12), (1.6, 0.66)], _GLASS)
+    polygon(image, scale, [(0.75, 0.66), (1.0, 0.12), (1.2, 0.12), (0.95, 0.66)], shade(_GLASS, 1.7))
+    rectangle(image, scale, 0, 0.7, width, 0.73, shade(colour, 0.55))
+    rectangle(image, scale, 0, 1.08, width, 1.28, shade(colour, 0.62))
     lamp: Colour = (236, 234, 218) if front else (178, 26, 30)
     for u in (0.05, 1.41):
-        _rectangle(image, scale, u, 0.78, u + 0.34, 0.98, lamp)
-        _rectangle(image, scale, u + (0.22 if u < 1 else 0.02), 0.8, u + (0.32 if u < 1 else 0.12), 0.96, (214, 140, 40))
+        rectangle(image, scale, u, 0.78, u + 0.34, 0.98, lamp)
+        rectangle(
+            image,
+            scale,
+            u + (0.22 if u < 1 else 0.02),
+            0.8,
+            u + (0.32 if u < 1 else 0.12),
+            0.96,
+            (214, 140, 40),
+        )
     if front:
         for v in (0.82, 0.88, 0.94):
-            _rectangle(image, scale, 0.5, v, 1.3, v + 0.04, _DARK)
+            rectangle(image, scale, 0.5, v, 1.3, v + 0.04, _DARK)
     else:
-        _rectangle(image, scale, 0.2, 0.66, 1.6, 0.68, _shade(colour, 1.25))
-    _rectangle(image, scale, 0.62, 1.1, 1.18, 1.22, (226, 226, 220))
+        rectangle(image, scale, 0.2, 0.66, 1.6, 0.68, shade(colour, 1.25))
+    rectangle(image, scale, 0.62, 1.1, 1.18, 1.22, (226, 226, 220))
     for k in range(6):
-        _rectangle(image, scale, 0.68 + 0.08 * k, 1.12, 0.72 + 0.08 * k, 1.2, _DARK)
+        rectangle(image, scale, 0.68 + 0.08 * k, 1.12, 0.72 + 0.08 * k, 1.2, _DARK)
     return image, mask > 0
 
 
@@ -168,25 +130,25 @@ def car_side(colour: Colour, *, van: bool) -> tuple[Bytes, Mask]:
     The estate car has its rear at the left, the van, upright at both ends, its front.
     """
     scale, width, height = 80.0, 4.3, 1.55
-    image = _blank(width, height, scale, colour)
+    image = blank(width, height, scale, colour)
     mask = np.zeros(image.shape[:2], np.uint8)
     bonnet = [(3.9, 0.0), (4.18, 0.06), (4.28, 0.6)] if van else [(2.2, 0.0), (2.55, 0.1), (3.15, 0.62), (4.1, 0.76)]
     pane = [(4.0, 0.12), (4.1, 0.62)] if van else [(2.2, 0.12), (2.45, 0.2), (2.95, 0.62)]
     outline = [(0.0, 0.72), (0.12, 0.06), (0.3, 0.0), *bonnet, (4.3, 0.95), (4.3, 1.3), (0.0, 1.3)]
-    _polygon(mask, scale, outline, 1)
-    _polygon(image, scale, [(0.3, 0.62), (0.4, 0.12), *pane], _GLASS)
-    _polygon(image, scale, [(0.6, 0.62), (0.9, 0.12), (1.1, 0.12), (0.8, 0.62)], _shade(_GLASS, 1.7))
+    polygon(mask, scale, outline, 1)
+    polygon(image, scale, [(0.3, 0.62), (0.4, 0.12), *pane], _GLASS)
+    polygon(image, scale, [(0.6, 0.62), (0.9, 0.12), (1.1, 0.12), (0.8, 0.62)], shade(_GLASS, 1.7))
     for u in (1.02, 1.98, 2.95):
-        _rectangle(image, scale, u, 0.1, u + 0.09, 0.64, colour)
+        rectangle(image, scale, u, 0.1, u + 0.09, 0.64, colour)
     for u in (1.06, 2.02, 3.1):
-        _rectangle(image, scale, u, 0.64, u + 0.02, 1.24, _shade(colour, 0.55))
+        rectangle(image, scale, u, 0.64, u + 0.02, 1.24, shade(colour, 0.55))
     for u in (1.12, 2.08):
-        _rectangle(image, scale, u, 0.74, u + 0.2, 0.78, _shade(colour, 0.5))
-    _rectangle(image, scale, 0, 0.68, 4.2, 0.7, _shade(colour, 1.3))
-    _rectangle(image, scale, 0, 1.2, width, height, _DARK)
+        rectangle(image, scale, u, 0.74, u + 0.2, 0.78, shade(colour, 0.5))
+    rectangle(image, scale, 0, 0.68, 4.2, 0.7, shade(colour, 1.3))
+    rectangle(image, scale, 0, 1.2, width, height, _DARK)
     lamps: list[Colour] = [(178, 26, 30), (236, 234, 218)]
     for u, lamp in ((0.0, lamps[van]), (4.12, lamps[not van])):
-        _rectangle(image, scale, u, 0.8, u + 0.18, 0.98, lamp)
+        rectangle(image, scale, u, 0.8, u + 0.18, 0.98, lamp)
     for u in (0.85, 3.45):
         centre = (round(u * scale), round(1.23 * scale))
         cv2.circle(image, centre, round(0.37 * scale), _DARK, -1)
@@ -199,11 +161,16 @@ def car_side(colour: Colour, *, van: bool) -> tuple[Bytes, Mask]:
 
 def tree(rng: Rng, width_m: float, height_m: float, hue: Colour, *, scale: float = 44.0) -> tuple[Bytes, Mask]:
     """Return a street tree, its trunk on the middle of the lower edge, and its outline."""
-    image = _blank(width_m, height_m, scale, (62, 52, 42))
+    image = blank(width_m, height_m, scale, (62, 52, 42))
     mask = np.zeros(image.shape[:2], np.uint8)
     middle, crown = width_m / 2, height_m * 0.36
-    trunk = [(middle - 0.1, 0.3 * height_m), (middle + 0.1, 0.3 * height_m), (middle + 0.16, height_m), (middle - 0.16, height_m)]
-    _polygon(mask, scale, trunk, 1)
+    trunk = [
+        (middle - 0.1, 0.3 * height_m),
+        (middle + 0.1, 0.3 * height_m),
+        (middle + 0.16, height_m),
+        (middle - 0.16, height_m),
+    ]
+    polygon(mask, scale, trunk, 1)
     for _ in range(7):
         end = (middle + rng.uniform(-0.34, 0.34) * width_m, rng.uniform(0.12, 0.4) * height_m)
         start = (round(middle * scale), round(0.66 * height_m * scale))
@@ -218,31 +185,31 @@ def tree(rng: Rng, width_m: float, height_m: float, hue: Colour, *, scale: float
         axes = (round(size * scale), round(size * scale * rng.uniform(0.5, 1.0)))
         centre = (round(u[k] * scale), round(v[k] * scale))
         turn = float(rng.uniform(0, 180))
-        cv2.ellipse(image, centre, axes, turn, 0, 360, _shade(hue, light), -1)
+        cv2.ellipse(image, centre, axes, turn, 0, 360, shade(hue, light), -1)
         cv2.ellipse(mask, centre, axes, turn, 0, 360, 1, -1)
-    return _blotches(rng, image, 9.0), mask > 0
+    return blotches(rng, image, 9.0), mask > 0
 
 
 def person(rng: Rng) -> tuple[Bytes, Mask]:
     """Return someone walking, 0.8 x 1.8 m, and the outline."""
     scale = 110.0
-    coat: Colour = tuple(rng.uniform(40, 220, 3))  # type: ignore[assignment]
-    legs: Colour = tuple(rng.uniform(30, 90, 3))  # type: ignore[assignment]
-    image = _blank(0.8, 1.8, scale, coat)
+    coat: Colour = any_colour(rng, 40, 220)
+    legs: Colour = any_colour(rng, 30, 90)
+    image = blank(0.8, 1.8, scale, coat)
     mask = np.zeros(image.shape[:2], np.uint8)
     parts = [
         ([(0.3, 0.9), (0.52, 0.9), (0.32, 1.76), (0.14, 1.76)], legs),
-        ([(0.34, 0.9), (0.54, 0.9), (0.68, 1.76), (0.52, 1.76)], _shade(legs, 0.8)),
+        ([(0.34, 0.9), (0.54, 0.9), (0.68, 1.76), (0.52, 1.76)], shade(legs, 0.8)),
         ([(0.1, 1.72), (0.32, 1.72), (0.32, 1.8), (0.08, 1.8)], _DARK),
         ([(0.5, 1.72), (0.7, 1.72), (0.74, 1.8), (0.5, 1.8)], _DARK),
         ([(0.24, 0.3), (0.56, 0.3), (0.64, 0.42), (0.58, 1.0), (0.26, 1.0), (0.2, 0.42)], coat),
-        ([(0.22, 0.4), (0.3, 0.42), (0.2, 0.9), (0.1, 0.88)], _shade(coat, 0.75)),
-        ([(0.52, 0.42), (0.62, 0.4), (0.72, 0.86), (0.62, 0.9)], _shade(coat, 0.8)),
-        ([(0.36, 0.42), (0.46, 0.42), (0.46, 0.98), (0.36, 0.98)], _shade(coat, 1.25)),
+        ([(0.22, 0.4), (0.3, 0.42), (0.2, 0.9), (0.1, 0.88)], shade(coat, 0.75)),
+        ([(0.52, 0.42), (0.62, 0.4), (0.72, 0.86), (0.62, 0.9)], shade(coat, 0.8)),
+        ([(0.36, 0.42), (0.46, 0.42), (0.46, 0.98), (0.36, 0.98)], shade(coat, 1.25)),
     ]
     for points, colour in parts:
-        _polygon(image, scale, points, colour)
-        _polygon(mask, scale, points, 1)
+        polygon(image, scale, points, colour)
+        polygon(mask, scale, points, 1)
     centre = (round(0.4 * scale), round(0.16 * scale))
     cv2.ellipse(mask, centre, (round(0.1 * scale), round(0.14 * scale)), 0, 0, 360, 1, -1)
     cv2.ellipse(image, centre, (round(0.11 * scale), round(0.16 * scale)), 0, 0, 360, (202, 160, 132), -1)
@@ -253,7 +220,7 @@ def person(rng: Rng) -> tuple[Bytes, Mask]:
 def sign(rng: Rng) -> tuple[Bytes, Mask]:
     """Return a round or a triangular road sign, 0.8 x 0.8 m, and its outline."""
     scale = 110.0
-    image = _blank(0.8, 0.8, scale, (188, 24, 30))
+    image = blank(0.8, 0.8, scale, (188, 24, 30))
     mask = np.zeros(image.shape[:2], np.uint8)
     centre = (round(0.4 * scale), round(0.4 * scale))
     if rng.random() < 0.5:
@@ -261,10 +228,10 @@ def sign(rng: Rng) -> tuple[Bytes, Mask]:
         cv2.circle(image, centre, round(0.3 * scale), (232, 232, 228), -1)
         cv2.putText(image, "30", (round(0.2 * scale), round(0.52 * scale)), cv2.FONT_HERSHEY_SIMPLEX, 1.15, _DARK, 4)
     else:
-        _polygon(mask, scale, [(0.0, 0.74), (0.4, 0.02), (0.8, 0.74)], 1)
-        _polygon(image, scale, [(0.16, 0.65), (0.4, 0.22), (0.64, 0.65)], (232, 232, 228))
-        _rectangle(image, scale, 0.37, 0.34, 0.43, 0.52, _DARK)
-        _rectangle(image, scale, 0.37, 0.55, 0.43, 0.61, _DARK)
+        polygon(mask, scale, [(0.0, 0.74), (0.4, 0.02), (0.8, 0.74)], 1)
+        polygon(image, scale, [(0.16, 0.65), (0.4, 0.22), (0.64, 0.65)], (232, 232, 228))
+        rectangle(image, scale, 0.37, 0.34, 0.43, 0.52, _DARK)
+        rectangle(image, scale, 0.37, 0.55, 0.43, 0.61, _DARK)
     return image, mask > 0
 
 
@@ -274,63 +241,4 @@ def hedge(rng: Rng, width_m: float, height_m: float) -> Bytes:
     rows = round(min(512, 512 * height_m / 2))
     strip = grey[:rows, : round(min(512, 512 * width_m / 4))]
     tint = np.array([0.62, 0.92, 0.4], np.float32) * np.float32(rng.uniform(0.75, 1.0))
-    return np.clip(strip[..., None] * tint, 0, 255).astype(np.uint8)
-
-
-def ground(rng: Rng, half_width_m: float, depth_m: float, kerb_m: float, cars: list[tuple[float, float]]) -> Bytes:
-    """Return the street from above, far end first: road, markings, pavements, and the shadows below `cars`.
-
-    `cars` are (X, Z of the near end), metres.
-    """
-    scale = 30.0
-    image = _blank(2 * half_width_m, depth_m, scale, (104, 104, 108))
-
-    def strip(x0: float, x1: float, z0: float, z1: float, colour: Colour) -> None:
-        _rectangle(image, scale, x0 + half_width_m, depth_m - z1, x1 + half_width_m, depth_m - z0, colour)
-
-    for side in (-1, 1):
-        low, high = sorted((side * kerb_m, side * half_width_m))
-        strip(low, high, 0, depth_m, (146, 138, 128))
-        for line in np.arange(kerb_m + 0.15, half_width_m, 0.6):
-            strip(side * line - 0.02, side * line + 0.02, 0, depth_m, (112, 106, 98))
-        for z in np.arange(0, min(depth_m, 40.0), 0.6):
-            strip(low, high, z, z + 0.045, (116, 110, 102))
-        strip(side * kerb_m - 0.09, side * kerb_m + 0.09, 0, depth_m, (182, 178, 170))
-        strip(side * kerb_m - 0.16 * side - 0.07, side * kerb_m - 0.16 * side + 0.07, 0, depth_m, (66, 66, 68))
-        strip(side * (kerb_m - 2.1) - 0.06, side * (kerb_m - 2.1) + 0.06, 0, depth_m, (208, 206, 200))
-    for z in np.arange(1.0 + float(rng.uniform(0, 2)), depth_m, 6.0):
-        strip(-0.08, 0.08, z, z + 3.0, (222, 220, 212))
-    crossing = float(rng.uniform(24, 32))
-    for x in np.arange(-kerb_m + 0.4, kerb_m - 0.4, 1.0):
-        strip(x, x + 0.5, crossing, crossing + 3.0, (214, 212, 206))
-    for _ in range(9):  # repaired asphalt and covers
-        x, z = float(rng.uniform(-kerb_m + 1, kerb_m - 1)), float(rng.uniform(4, 40))
-        tone = float(rng.uniform(70, 92))
-        if rng.random() < 0.4:
-            centre = (round((x + half_width_m) * scale), round((depth_m - z) * scale))
-            cv2.circle(image, centre, round(0.33 * scale), (72, 66, 60), -1)
-            cv2.circle(image, centre, round(0.26 * scale), (94, 86, 78), 2)
-        else:
-            strip(x, x + float(rng.uniform(0.6, 2.0)), z, z + float(rng.uniform(1, 5)), (tone, tone, tone + 3))
-    image = _blotches(rng, image, 3.0)
-    shadow = np.ones((image.shape[0] // 4, image.shape[1] // 4), np.float32)
-    for x, z in cars:
-        low = (round((x - 1.05 + half_width_m) * scale / 4), round((depth_m - z - 4.5) * scale / 4))
-        high = (round((x + 1.05 + half_width_m) * scale / 4), round((depth_m - z + 0.15) * scale / 4))
-        cv2.rectangle(shadow, low, high, 0.25, -1)
-    shadow = cv2.resize(cv2.GaussianBlur(shadow, (0, 0), 1.6), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    return cv2.multiply(image, cv2.merge([shadow] * 3), dtype=cv2.CV_8U)
-
-
-def sky(rng: Rng) -> Bytes:
-    """Return a summer sky, 128 x 512, from the horizon's haze up to a deeper blue."""
-    height, width = 128, 512
-    up = np.linspace(1, 0, height, dtype=np.float32)[:, None, None] ** np.float32(0.8)
-    image = np.array([214, 224, 234], np.float32) + up * (np.array([96, 146, 206], np.float32) - [214, 224, 234])
-    image = np.repeat(image, width, axis=1)
-    cloud = np.zeros((height, width), np.float32)
-    for cells, weight in ((5, 1.0), (11, 0.6), (24, 0.35), (50, 0.2)):
-        noise = rng.standard_normal((max(2, cells // 2), cells), np.float32)
-        cloud += weight * cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
-    share = np.clip(cloud - 0.1, 0, 1)[..., None] * np.float32(0.85)
-    return np.clip(image + share * (np.float32(246) - image), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(strip[..., None] * tint, 0, 255), np.uint8)

@@ -1,4 +1,4 @@
-"""A street as a list of planar patches: ground, two rows of houses, trees, parked and moving cars, people, poles.
+"""A street as a list of flat patches: ground, houses, trees, parked and moving cars, people, poles.
 
 All sizes are metres, so that a picture of any size shows the same street. Everything is drawn from one
 generator in a fixed order: the same seed gives the same street whatever the image size.
@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit_evaluation import _sprites
+from stereokit_evaluation import _backdrops, _sprites
 from stereokit_evaluation._geometry import Patch
 from stereokit_evaluation._textures import Decal, Look, Texture, photograph
 
@@ -34,8 +34,8 @@ _PLASTER: tuple[Colour, ...] = (
     (150, 164, 182), (222, 188, 110), (196, 196, 192), (128, 84, 70),
 )  # fmt: skip
 _PAINT: tuple[Colour, ...] = (
-    (168, 28, 32), (34, 66, 128), (196, 198, 202), (58, 62, 68), (228, 228, 224), (30, 92, 74), (204, 146, 34),
-    (92, 126, 158), (110, 30, 52),
+    (168, 28, 32), (34, 66, 128), (196, 198, 202), (58, 62, 68), (228, 228, 224), (30, 92, 74),
+    (204, 146, 34), (92, 126, 158), (110, 30, 52),
 )  # fmt: skip
 _LEAVES: tuple[Colour, ...] = ((92, 124, 50), (72, 108, 46), (128, 132, 44), (176, 122, 38), (84, 116, 64))
 _LEAFY, _WOVEN, _PAINTED = ("grass", 1.7, 0.4), ("brick", 1.1, 0.35), ("gravel", 0.9, 0.2)
@@ -51,7 +51,19 @@ def _grain(name: str, size_m: float) -> Texture:
 
 def _glint(u0: float, v0: float, u1: float, v1: float, u: float, v: float, radius: float, shift: float) -> Decal:
     """Return a highlight at (u, v) within a pane, `shift` metres further along u in the right view."""
-    return Decal("specular", u0, v0, u1, v1, (205.0, 210.0, 214.0), u=u, v=v, radius_u=radius, radius_v=radius, shift_u=shift)
+    return Decal(
+        "specular",
+        u0,
+        v0,
+        u1,
+        v1,
+        (205.0, 210.0, 214.0),
+        u=u,
+        v=v,
+        radius_u=radius,
+        radius_v=radius,
+        shift_u=shift,
+    )
 
 
 class _Street:
@@ -74,7 +86,8 @@ class _Street:
 
     def upright(self, image: Bytes, mask: NDArray[np.bool_] | None, middle: float, z: float, width: float,
                 height: float, *, foot: float = 0.0, light: float = 1.0, yaw: float = 0.0, object_id: int = 0,
-                grain: tuple[str, float, float] = ("gravel", 1.7, 0.3), decals: tuple[Decal, ...] = ()) -> None:  # fmt: skip
+                grain: tuple[str, float, float] = ("gravel", 1.7, 0.3),
+                decals: tuple[Decal, ...] = ()) -> None:  # fmt: skip
         """Stand a picture up, facing the camera but for `yaw` (radians), its foot `foot` above the ground."""
         across = (float(np.cos(yaw)), 0.0, float(np.sin(yaw)))
         top = CAMERA_HEIGHT_M - foot - height
@@ -97,7 +110,7 @@ class _Street:
             lean = float(rng.uniform(-0.035, 0.035))
             decals = self._facade_decals(width, height) if not bare else ()
             look = Look(
-                Texture(_sprites.facade(rng, width, height, colour, bare=bare, scale=fine), width, height),
+                Texture(_backdrops.facade(rng, width, height, colour, bare=bare, scale=fine), width, height),
                 None if bare else grain, 0.9 if brick else 0.35, light, decals, flat=bare,
             )  # fmt: skip
             top = CAMERA_HEIGHT_M - height
@@ -109,7 +122,7 @@ class _Street:
                 along = (-along[0], 0.0, -along[2])
             self.patches.append(Patch(corner, along, (0, 1, 0), width, height, look))
             gable = Look(
-                Texture(_sprites.facade(rng, 9.0, height, colour, scale=min(fine, 24.0)), 9.0, height),
+                Texture(_backdrops.facade(rng, 9.0, height, colour, scale=min(fine, 24.0)), 9.0, height),
                 grain, 0.8, light * 0.85,
             )  # fmt: skip
             start = -distance - 9.0 if side < 0 else distance
@@ -130,7 +143,7 @@ class _Street:
         self.patches.append(Patch(place, along, (0, 1, 0), wide, tall, look))
 
     def _facade_decals(self, width: float, height: float) -> tuple[Decal, ...]:
-        """Return what is hard to match on a house: empty plaster, a mirror-like pane, a changed brightness."""
+        """Return what is hard to match on a house: empty plaster or a changed brightness."""
         rng = self.rng
         if not self.hard:
             return ()
@@ -154,8 +167,30 @@ class _Street:
             image, mask = _sprites.car_end(colour, front=middle < 0)
             decals: tuple[Decal, ...] = ()
             if self.hard and rng.random() < 0.4:
-                decals = (_glint(0.3, 0.12, 1.5, 0.66, float(rng.uniform(0.6, 1.0)), 0.35, 0.16, float(rng.uniform(0.1, 0.4))),)
-            self.upright(image, mask, middle, z, 1.8, 1.55, light=light, object_id=number, grain=_PAINTED, decals=decals)
+                decals = (
+                    _glint(
+                        0.3,
+                        0.12,
+                        1.5,
+                        0.66,
+                        float(rng.uniform(0.6, 1.0)),
+                        0.35,
+                        0.16,
+                        float(rng.uniform(0.1, 0.4)),
+                    ),
+                )
+            self.upright(
+                image,
+                mask,
+                middle,
+                z,
+                1.8,
+                1.55,
+                light=light,
+                object_id=number,
+                grain=_PAINTED,
+                decals=decals,
+            )
             inner = middle - 0.9 if middle > 0 else middle + 0.9
             if abs(inner) < 0.8 or inner * middle < 0:
                 continue
@@ -169,9 +204,15 @@ class _Street:
                 side_image, side_mask = side_image[:, ::-1], side_mask[:, ::-1]
             panel = (Decal("textureless", 0.9, 0.72, 3.2, 1.18, colour),) if plain else ()
             look = Look(
-                Texture(np.ascontiguousarray(side_image), 4.3, 1.55), _grain("gravel", 0.9), 0.2, light * 0.8, panel
+                Texture(np.ascontiguousarray(side_image), 4.3, 1.55),
+                _grain("gravel", 0.9),
+                0.2,
+                light * 0.8,
+                panel,
             )
-            self.patches.append(Patch(origin, along, (0, 1, 0), 4.3, 1.55, look, number, np.ascontiguousarray(side_mask)))
+            self.patches.append(
+                Patch(origin, along, (0, 1, 0), 4.3, 1.55, look, number, np.ascontiguousarray(side_mask))
+            )
 
     def furniture(self) -> None:
         """Put trees, lamps, signs, people, boxes and hedges on both pavements."""
@@ -206,7 +247,8 @@ class _Street:
             picture = photograph(self.pictures.pop())
             side = int(rng.choice([-1, 1]))
             self.upright(picture, None, side * float(rng.uniform(6.6, 7.2)), float(rng.uniform(9, 13)),
-                         1.5 * picture.shape[1] / picture.shape[0], 1.5, foot=0.35, object_id=self._new_object(),
+                         1.5 * picture.shape[1] / picture.shape[0], 1.5, foot=0.35,
+                         object_id=self._new_object(),
                          yaw=-side * float(rng.uniform(0.1, 0.5)))  # fmt: skip
 
     def far_end(self) -> None:
@@ -214,7 +256,7 @@ class _Street:
         rng = self.rng
         for x in np.arange(-60, 60, 15.0):
             height = float(rng.uniform(9, 17))
-            image = _sprites.facade(rng, 15.0, height, self._one_of(_PLASTER), scale=10.0)
+            image = _backdrops.facade(rng, 15.0, height, self._one_of(_PLASTER), scale=10.0)
             z = _FAR_M - float(rng.uniform(0, 6))
             self.upright(image, None, float(x) + 7.5, z, 15.0, height, grain=_WOVEN, light=0.95)
         for x in np.arange(-26, 27, 6.5):
@@ -242,7 +284,7 @@ def street(rng: Rng, *, hard_cases: bool = True) -> list[Patch]:
             if rng.random() < 0.75:
                 places.append((side * float(rng.uniform(4.35, 4.7)), z))
             z += float(rng.uniform(5.4, 8.5))
-    image = _sprites.ground(rng, _HALF_WIDTH_M, _FAR_M, _KERB_M, places)
+    image = _backdrops.ground(rng, _HALF_WIDTH_M, _FAR_M, _KERB_M, places)
     decals: tuple[Decal, ...] = ()
     if hard_cases:
         u, v = _HALF_WIDTH_M + float(rng.uniform(-3.5, 1.0)), _FAR_M - float(rng.uniform(9.5, 13))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -56,7 +56,8 @@ class Texture:
     image : (h, w) or (h, w, 3) uint8
         The finest level.
     width_m, height_m : float
-        Size that the image covers on the patch. Past it a tile repeats, mirrored; any other image keeps its border.
+        Size that the image covers on the patch. Past it a tile repeats, mirrored; any other image keeps its
+        border.
     tile : bool
         Whether it repeats.
     """
@@ -68,7 +69,7 @@ class Texture:
             width_m, height_m = 2 * width_m, 2 * height_m
         self.width_m, self.height_m, self.tile = width_m, height_m, tile
         self.step = max(width_m / image.shape[1], height_m / image.shape[0])
-        levels = [image]
+        levels: list[Any] = [image]
         while min(levels[-1].shape[:2]) > 4 and len(levels) < 9:
             h, w = levels[-1].shape[:2]
             levels.append(cv2.resize(levels[-1], ((w + 1) // 2, (h + 1) // 2), interpolation=cv2.INTER_AREA))
@@ -187,9 +188,7 @@ class Look:
     flat: bool = False
 
 
-def paint(
-    look: Look, u: Float, v: Float, depth: Float, step: Float, *, right: bool
-) -> Float32:
+def paint(look: Look, u: Float, v: Float, depth: Float, step: Float, *, right: bool) -> Float32:
     """Return the colours of n points of a patch, (n, 3) float32, about 0..255.
 
     Parameters

@@ -1,6 +1,6 @@
-"""The command ``stereokit demo``: match a synthetic street, score every method, and draw one picture of it all.
+"""The command ``stereokit demo``: match a synthetic street, score every method, draw one picture of it all.
 
-It needs no data set: the pair and its exact ground truth come from `stereokit_evaluation.scenes`. Scores are those
+It needs no data set: the pair and its exact truth come from `stereokit_evaluation.scenes`. Scores are those
 of the KITTI 2015 development kit, on one image. `overview` draws the picture from any maps.
 """
 
@@ -105,7 +105,12 @@ def overview(left: Picture, truth: Picture, panels: Sequence[Panel], *, tile_wid
     for panel in panels:
         time_taken = "" if panel.milliseconds is None else f"   {panel.milliseconds:.0f} ms"
         wrong = "error" if panel.d1 is None else f"error, D1 {panel.d1:.2f} %"
-        rows.append(((f"{panel.name}{time_taken}", panel.disparity), (f"{panel.name.split()[0]} {wrong}", panel.error)))
+        rows.append(
+            (
+                (f"{panel.name}{time_taken}", panel.disparity),
+                (f"{panel.name.split()[0]} {wrong}", panel.error),
+            )
+        )
     for caption, picture in (tile for row in rows for tile in row):
         if picture.shape != left.shape or picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
             raise InputError(
@@ -161,13 +166,9 @@ def demo(
             start = time.perf_counter()
             found = matcher(left, right)
             times.append(time.perf_counter() - start)
-        scored = score(
-            found.disparity, noc=scene.noc, occ=scene.occ, objects=scene.objects, measured=found.valid
-        )
+        scored = score(found.disparity, noc=scene.noc, occ=scene.occ, objects=scene.objects, measured=found.valid)
         label = f"{short[name]} {name}" if name in short else name
-        outcomes.append(
-            _Outcome(name, label, str(matcher.device), found.disparity, scored, statistics.median(times))
-        )
+        outcomes.append(_Outcome(name, label, str(matcher.device), found.disparity, scored, statistics.median(times)))
     _write_pictures(output, scene, outcomes)
     document = {"results": [_as_json(outcome) for outcome in outcomes]}
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
@@ -198,7 +199,7 @@ def _check_places(output: Path, json_file: Path | None) -> None:
 
 
 def _write_pictures(folder: Path, scene: Scene, outcomes: Sequence[_Outcome]) -> None:
-    """Write left, right, truth, each method's disparity and error, and the overview; colours mean the same in all."""
+    """Write left, right, truth, each method's maps and the overview; a colour means the same in all."""
     high = max(1.0, float(scene.disparity.max()))
     truth = colorize(scene.disparity, 0.0, high)
     panels: list[Panel] = []

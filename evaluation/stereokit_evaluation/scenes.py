@@ -3,21 +3,22 @@
 A scene is a list of planar patches (`_street`) seen by two cameras (`_geometry`) and painted with continuous
 textures (`_textures`). Both views are drawn from the same functions at exactly corresponding points, so the
 truth is that of the pixel centre, in closed form, and no view was warped from the other. On top come the
-hard cases that the StereoVAE paper names (textureless and mirror-like surfaces, brightness that differs between
-the views) and a plain camera: blur, gain and offset, Gaussian noise, rounding to 8 bits.
+hard cases that the StereoVAE paper names (textureless and mirror-like surfaces, brightness that differs
+between the views) and a plain camera: blur, gain and offset, Gaussian noise, rounding to 8 bits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import OptionError
-from stereokit_evaluation import _sprites
+from stereokit_evaluation import _backdrops
 from stereokit_evaluation._geometry import Camera, Plane, occlusion, plane_of, rasterise, texture_coordinates
 from stereokit_evaluation._street import CAMERA_HEIGHT_M, street
 from stereokit_evaluation._textures import Texture, paint
@@ -139,7 +140,7 @@ def generate(
         raise OptionError(f"offset must be finite, got {offset!r}")
     world, sensor = (np.random.default_rng([seed, part]) for part in (0, 1))
     patches = street(world, hard_cases=hard_cases)
-    heaven = Texture(_sprites.sky(world), 1.0, 1.0)
+    heaven = Texture(_backdrops.sky(world), 1.0, 1.0)
     columns, rows = np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
     camera = _camera(int(width), int(height), max_disparity)
     while True:
@@ -152,7 +153,7 @@ def generate(
         camera = replace(camera, baseline_m=camera.baseline_m * 0.98 * (max_disparity - 1) / largest)
     pictures = []
     for planes in (lefts, rights):
-        picture = _render(planes, heaven, int(width), int(height), right=planes is rights)
+        picture: NDArray[Any] = _render(planes, heaven, int(width), int(height), right=planes is rights)
         if blur > 0:
             picture = cv2.GaussianBlur(picture, (0, 0), blur).reshape(picture.shape)
         if planes is rights:
@@ -204,7 +205,8 @@ def _render(
     """Return one view without camera effects, (H, W, 3) float32."""
     picture = np.zeros((height * width, 3), np.float32)
     for dx, dy in _SAMPLES:
-        columns, rows = np.arange(width) + dx, np.arange(height) + dy
+        columns = np.arange(width, dtype=np.float64) + dx
+        rows = np.arange(height, dtype=np.float64) + dy
         for number, where in _split(rasterise(planes, columns, rows)[0]):
             x, y = columns[where % width], rows[where // width]
             plane = planes[number - 1] if number else None
@@ -214,8 +216,8 @@ def _render(
                 u, v, depth, step = texture_coordinates(plane, x, y)
                 colour = paint(plane.patch.look, u, v, depth, step, right=right)
             picture[where] += colour
-    picture = np.clip(picture / np.float32(len(_SAMPLES)), 0, 255)
-    return picture.reshape(height, width, 3)
+    mean: NDArray[np.float32] = np.clip(picture / np.float32(len(_SAMPLES)), 0, 255)
+    return mean.reshape(height, width, 3)
 
 
 def _regions(planes: Sequence[Plane | None], surface: NDArray[np.int16]) -> dict[str, NDArray[np.bool_]]:

@@ -163,7 +163,7 @@ def _horizontals(buffers: PathBuffers) -> None:
 
 @inline
 def _verticals(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, last: bool, stored: bool) -> None:
-    """The paths from the row before, for sweep row `k`.
+    """Advance the paths from the row before to sweep row `k`.
 
     Before the last visit their brackets are added into ``sums[base:]``; at the last one everything is summed
     into `total`, with what the other sweep left in `sums` if `stored`.

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -56,6 +57,7 @@ from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, keys_of, select_pixel
 
 __all__ = ["Dt", "edge_weights"]
+
 
 class Weights(NamedTuple):
     """Feedback by grey difference of the step, of one pass: (256,) float32, or int16 times 2**15."""
@@ -162,31 +164,27 @@ class Dt:
         band = max(1, min(width, 2**20 // max(1, height * padded * np.dtype(dtype).itemsize)))
         bands = spans(width, -(-width // band))
         band = max(x1 - x0 for x0, x1 in bands)
+        parts = spans(height, min(threads, len(rows)))
+        shares = [bands[k::threads] for k in range(min(threads, len(bands)))]
+
+        def filter_rows(k: int, y0: int, y1: int, weights: Weights, first: bool) -> None:
+            row = workspace.array(f"dt.row{k}", width * padded, dtype)
+            if first and volume is None:
+                fresh = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
+                _produce_rows(rows[k], blocks, guide, weights, y0, y1, fresh, row, costs)
+            else:
+                _filter_rows(blocks, guide, weights, y0, y1, row, costs)
+
+        def filter_bands(k: int, weights: Weights, last: bool) -> None:
+            column = workspace.array(f"dt.band{k}", height * band * padded, dtype)
+            state = workspace.array(f"dt.state{k}", band * padded, dtype)
+            for x0, x1 in shares[k]:
+                _filter_band(blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep)
+
         for number, weights in enumerate(passes):
             last = number == len(passes) - 1
-
-            def filter_rows(k: int, y0: int, y1: int, weights: Weights = weights, number: int = number) -> None:
-                row = workspace.array(f"dt.row{k}", width * padded, dtype)
-                if number == 0 and volume is None:
-                    fresh = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
-                    _produce_rows(rows[k], blocks, guide, weights, y0, y1, fresh, row, costs)
-                else:
-                    _filter_rows(blocks, guide, weights, y0, y1, row, costs)
-
-            def filter_bands(
-                k: int, part: list[tuple[int, int]], weights: Weights = weights, last: bool = last
-            ) -> None:
-                column = workspace.array(f"dt.band{k}", height * band * padded, dtype)
-                state = workspace.array(f"dt.state{k}", band * padded, dtype)
-                for x0, x1 in part:
-                    _filter_band(
-                        blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep
-                    )
-
-            parts = spans(height, min(threads, len(rows)))
-            run([lambda k=k, y=y: filter_rows(k, *y) for k, y in enumerate(parts)], threads)  # type: ignore[misc]
-            shares = [bands[k::threads] for k in range(min(threads, len(bands)))]
-            run([lambda k=k, s=s: filter_bands(k, s) for k, s in enumerate(shares)], threads)  # type: ignore[misc]
+            run([partial(filter_rows, k, *y, weights, number == 0) for k, y in enumerate(parts)], threads)
+            run([partial(filter_bands, k, weights, last) for k in range(len(shares))], threads)
 
 
 def edge_weights() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -198,7 +196,7 @@ def edge_weights() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def _feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
-    """value + weight * (before - keep * value), for vectors of int16 or float32; compiled code only."""
+    """Value + weight * (before - keep * value), for vectors of int16 or float32; compiled code only."""
     raise NotImplementedError("compiled code only")
 
 
@@ -206,9 +204,7 @@ def _feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
 def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     if value.scalar == types.int16:
         return lambda value, before, weight, keep: add(value, multiply_q15(subtract(before, value), weight))
-    return lambda value, before, weight, keep: add(
-        value, multiply(weight, subtract(before, multiply(keep, value)))
-    )
+    return lambda value, before, weight, keep: add(value, multiply(weight, subtract(before, multiply(keep, value))))
 
 
 def _unpack(costs: Any, at: int, shift: int, like: Any) -> Any:
@@ -236,9 +232,7 @@ def _choose_pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
             costs,
             at,
             convert(
-                minimum(
-                    shift_right(add(value, splat(np.int16((1 << shift) >> 1))), shift), splat(np.int16(255))
-                ),
+                minimum(shift_right(add(value, splat(np.int16((1 << shift) >> 1))), shift), splat(np.int16(255))),
                 np.uint8(0),
             ),
         )
@@ -247,7 +241,8 @@ def _choose_pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
 
 @inline
 def _jump(guide: NDArray[np.uint8], y: int, x: int, y2: int, x2: int) -> int:
-    return abs(np.int32(guide[y, x]) - np.int32(guide[y2, x2]))
+    difference: int = abs(np.int32(guide[y, x]) - np.int32(guide[y2, x2]))
+    return difference
 
 
 @inline

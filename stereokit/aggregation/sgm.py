@@ -154,9 +154,7 @@ class Sgm:
         )
         run(
             [
-                lambda: _last_visit(
-                    rows[0], a, guide, p1, p2, middle, height, 1, middle, sums, True, out, keep
-                ),
+                lambda: _last_visit(rows[0], a, guide, p1, p2, middle, height, 1, middle, sums, True, out, keep),
                 lambda: _last_visit(
                     rows[1], b, guide, p1, p2, middle - 1, -1, -1, height - middle, sums, True, out, keep
                 ),

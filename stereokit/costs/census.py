@@ -10,12 +10,13 @@ by plane, one load, one exclusive or, one population count and one addition of b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Pair, Cells, close_row, implements, pad_pair, cells_of
+from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements, pad_pair
 from stereokit.errors import OptionError
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.pool import run, spans
@@ -73,12 +74,7 @@ class Census:
         height, width = pair.left.shape
         across, down = (size // 2 for size in _WINDOWS[self.window])
         margin = max(across, down)
-        offsets = [
-            (dy, dx)
-            for dy in range(-down, down + 1)
-            for dx in range(-across, across + 1)
-            if (dy, dx) != (0, 0)
-        ]
+        offsets = [(dy, dx) for dy in range(-down, down + 1) for dx in range(-across, across + 1) if (dy, dx) != (0, 0)]
         dy, dx = (np.array(part, np.int64) for part in zip(*offsets, strict=True))
         planes = -(-len(offsets) // 8)
         left, right = pad_pair(pair, margin, workspace)
@@ -90,12 +86,8 @@ class Census:
         right_image = (right.ravel(), right.shape[1], margin, width + pair.levels.padded)
         tasks: list[Any] = []
         for y0, y1 in spans(height, pair.threads):
-            tasks.append(
-                lambda y0=y0, y1=y1: _transform(*left_image, dy, dx, y0, y1, left_planes, left_stride)
-            )
-            tasks.append(
-                lambda y0=y0, y1=y1: _transform(*right_image, dy, -dx, y0, y1, right_planes, right_stride)
-            )
+            tasks.append(partial(_transform, *left_image, dy, dx, y0, y1, left_planes, left_stride))
+            tasks.append(partial(_transform, *right_image, dy, -dx, y0, y1, right_planes, right_stride))
         run(tasks, pair.threads)
         cells = cells_of(pair, self.cost_max, workspace)
         rows = CensusRows(cells, tuple(range(planes)), left_planes, left_stride, right_planes, right_stride)

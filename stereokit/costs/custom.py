@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -73,6 +73,5 @@ class RowCost:
                 if pair.left_bad is not None:
                     row[pair.left_bad[y]] = worst
 
-        tasks: list[Any] = [lambda y0=y0, y1=y1: fill(y0, y1) for y0, y1 in spans(height, pair.threads)]
-        run(tasks, pair.threads)
+        run([partial(fill, y0, y1) for y0, y1 in spans(height, pair.threads)], pair.threads)
         return [VolumeRows(volume, levels.padded)] * workers

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -33,7 +34,20 @@ from stereokit.kernels.pool import run, spans
 from stereokit.kernels.simd import LANES, either, load, maximum, minimum, splat, store
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["WORST", "Cells", "Cost", "Levels", "Pair", "VolumeRows", "close_row", "cost_row", "implements", "pad_pair", "cells_of", "produce_volume"]
+__all__ = [
+    "WORST",
+    "Cells",
+    "Cost",
+    "Levels",
+    "Pair",
+    "VolumeRows",
+    "cells_of",
+    "close_row",
+    "cost_row",
+    "implements",
+    "pad_pair",
+    "produce_volume",
+]
 
 WORST = np.uint8(255)
 """Cost of the levels that pad a row to a multiple of `LANES`; it saturates and can never win."""
@@ -155,9 +169,17 @@ def cells_of(pair: Pair, cost_max: int, workspace: Workspace) -> Cells:
     padding[: levels.count] = 0
     padding[levels.count :] = WORST
     return Cells(
-        width, tuple(range(levels.padded // LANES)), levels.padded, levels.minimum, outside, low.ravel(), high.ravel(), 0 if shared else stride,
-        left_bad, padding,
-    )  # fmt: skip
+        width,
+        tuple(range(levels.padded // LANES)),
+        levels.padded,
+        levels.minimum,
+        outside,
+        low.ravel(),
+        high.ravel(),
+        0 if shared else stride,
+        left_bad,
+        padding,
+    )
 
 
 @inline
@@ -225,8 +247,8 @@ def pad_pair(pair: Pair, margin: int, workspace: Workspace) -> tuple[NDArray[Any
     start = width - 1 - pair.levels.minimum + margin
     tasks: list[Callable[[], object]] = []
     for y0, y1 in spans(rows, pair.threads):
-        tasks.append(lambda y0=y0, y1=y1: _pad(pair.left, y0, y1, margin, -(10**9), left))  # type: ignore[misc]
-        tasks.append(lambda y0=y0, y1=y1: _pad(pair.right, y0, y1, margin, start, right))  # type: ignore[misc]
+        tasks.append(partial(_pad, pair.left, y0, y1, margin, -(10**9), left))
+        tasks.append(partial(_pad, pair.right, y0, y1, margin, start, right))
     run(tasks, pair.threads)
     return left, right
 
@@ -236,7 +258,7 @@ def produce_volume(rows: list[Any], shape: tuple[int, int], levels: Levels, thre
     height, width = shape
     padded = np.empty((height, width * levels.padded), np.uint8)
     parts = spans(height, threads)
-    run([lambda k=k, y=y: _produce(rows[k], *y, padded) for k, y in enumerate(parts)], threads)  # type: ignore[misc]
+    run([partial(_produce, rows[k], y0, y1, padded) for k, (y0, y1) in enumerate(parts)], threads)
     return np.ascontiguousarray(padded.reshape(height, width, levels.padded)[:, :, : levels.count])
 
 

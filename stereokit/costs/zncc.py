@@ -14,6 +14,7 @@ work per cell does not grow with the window. The cost is rounded to `steps` leve
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Pair, Cells, close_row, implements, pad_pair, cells_of
+from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements, pad_pair
 from stereokit.errors import OptionError
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
@@ -109,16 +110,8 @@ class Zncc:
         tasks: list[Any] = []
         for k, (y0, y1) in enumerate(spans(height, pair.threads)):
             work = workspace.array(f"zncc.work{k}", (2, 2, right_width + 2 * half), np.int64)
-            tasks.append(
-                lambda y0=y0, y1=y1, work=work: _statistics(
-                    left, y0, y1, self.window, self.steps, work[0], left_sum, left_scale
-                )
-            )
-            tasks.append(
-                lambda y0=y0, y1=y1, work=work: _statistics(
-                    right, y0, y1, self.window, 1, work[1], right_sum, right_scale
-                )
-            )
+            tasks.append(partial(_statistics, left, y0, y1, self.window, self.steps, work[0], left_sum, left_scale))
+            tasks.append(partial(_statistics, right, y0, y1, self.window, 1, work[1], right_sum, right_scale))
         run(tasks, pair.threads)
         cells = cells_of(pair, self.cost_max, workspace)
         rows = []
@@ -128,20 +121,34 @@ class Zncc:
             at[0] = -1
             rows.append(
                 ZnccRows(
-                    cells, half, left.ravel(), left.shape[1], right.ravel(), right.shape[1], left_sum.ravel(),
-                    left_scale.ravel(), right_sum.ravel(), right_scale.ravel(), right_width, self.steps, sums, at,
-                )  # fmt: skip
+                    cells,
+                    half,
+                    left.ravel(),
+                    left.shape[1],
+                    right.ravel(),
+                    right.shape[1],
+                    left_sum.ravel(),
+                    left_scale.ravel(),
+                    right_sum.ravel(),
+                    right_scale.ravel(),
+                    right_width,
+                    self.steps,
+                    sums,
+                    at,
+                )
             )
         return rows
 
     def _in_range(self, image: NDArray[Any]) -> NDArray[Any]:
         """Return `image` centred around 0 and, if need be, scaled to `range_max`: rho does not change."""
         if image.dtype == np.uint8 and self.range_max >= 255:
-            return (image ^ np.uint8(128)).view(np.int8)
+            return np.asarray((image ^ np.uint8(128)).view(np.int8))
         low, high = int(image.min()), int(image.max())
         factor = min(1.0, self.range_max / max(high - low, 1))
-        middle = (low + high) / 2
-        return np.rint((image.astype(np.float64) - middle) * factor).astype(np.int16)
+        centred = image.astype(np.float32)
+        centred -= np.float32((low + high) / 2)
+        centred *= np.float32(factor)
+        return np.asarray(np.rint(centred, out=centred), np.int16)
 
 
 @kernel
@@ -184,7 +191,7 @@ def _statistics(
 
 
 def _products(a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
-    """a * row_a - b * row_b as int32 vectors; compiled code only."""
+    """Return ``a * row_a - b * row_b`` as int32 vectors; compiled code only."""
     raise NotImplementedError("compiled code only")
 
 

@@ -122,7 +122,7 @@ def _pointer(context: Any, builder: Any, kind: Any, array: Any, offset: Any) -> 
     return builder.bitcast(builder.gep(data, [offset]), ir.PointerType(Vector(kind.dtype).llvm))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def load(typing: Any, array: Any, offset: Any) -> Any:
     """Return `LANES` elements of the flat `array` from `offset` on."""
     size = array.dtype.bitwidth // 8
@@ -133,7 +133,7 @@ def load(typing: Any, array: Any, offset: Any) -> Any:
     return Vector(array.dtype)(array, types.intp), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def store(typing: Any, array: Any, offset: Any, value: Any) -> Any:
     """Write the lanes of `value` into the flat `array` from `offset` on."""
     if not isinstance(value, Vector) or value.scalar != array.dtype:
@@ -147,7 +147,7 @@ def store(typing: Any, array: Any, offset: Any, value: Any) -> Any:
     return types.void(array, types.intp, value), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def splat(typing: Any, scalar: Any) -> Any:
     """Return a vector whose lanes all hold `scalar`, of the scalar's own type."""
     kind = Vector(scalar)
@@ -201,9 +201,7 @@ def _q15(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
     return builder.trunc(rounded, kind.llvm)
 
 
-add = _binary(
-    "add", "Return a + b, wrapping.", lambda b, k, x, y: b.add(x, y), lambda b, k, x, y: b.fadd(x, y)
-)
+add = _binary("add", "Return a + b, wrapping.", lambda b, k, x, y: b.add(x, y), lambda b, k, x, y: b.fadd(x, y))
 subtract = _binary(
     "subtract", "Return a - b, wrapping.", lambda b, k, x, y: b.sub(x, y), lambda b, k, x, y: b.fsub(x, y)
 )
@@ -222,7 +220,7 @@ xor = _binary("xor", "Return the exclusive or of the bits.", lambda b, k, x, y: 
 either = _binary("either", "Return the bits set in a or in b.", lambda b, k, x, y: b.or_(x, y))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def less_bit(typing: Any, a: Any, b: Any, bit: Any) -> Any:
     """Return `bit` (a ``uint8``) in the ``uint8`` lanes where a < b, and 0 elsewhere."""
     result = Vector(types.uint8)
@@ -236,7 +234,7 @@ def less_bit(typing: Any, a: Any, b: Any, bit: Any) -> Any:
     return result(a, b, types.uint8), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def count_bits(typing: Any, value: Any) -> Any:
     """Return the number of bits set in each lane."""
 
@@ -246,7 +244,7 @@ def count_bits(typing: Any, value: Any) -> Any:
     return value(value), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def convert(typing: Any, value: Any, like: Any) -> Any:
     """Return `value` with its lanes converted to the scalar type of `like` (a scalar; its value is unused).
 
@@ -315,7 +313,7 @@ shift_down = _shuffle(
 )
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def lowest(typing: Any, value: Any) -> Any:
     """Return the smallest lane of an integer vector."""
 
@@ -326,7 +324,7 @@ def lowest(typing: Any, value: Any) -> Any:
     return value.scalar(value), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def lowest_of_3(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """Return the smallest lanes of three ``uint8`` vectors in the three low bytes of a ``uint32``.
 
@@ -367,7 +365,7 @@ def lowest_of_3(typing: Any, a: Any, b: Any, c: Any) -> Any:
     return types.uint32(a, b, c), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def mask_equal(typing: Any, a: Any, b: Any) -> Any:
     """Return a ``uint64`` whose bit d tells whether lane d of a and b are equal."""
 
@@ -377,7 +375,7 @@ def mask_equal(typing: Any, a: Any, b: Any) -> Any:
     return types.uint64(a, b), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def first_bit(typing: Any, mask: Any) -> Any:
     """Return the position of the lowest set bit of a ``uint64``, 64 if there is none."""
 
@@ -388,7 +386,7 @@ def first_bit(typing: Any, mask: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def choose(typing: Any, condition: Any, a: Any, b: Any) -> Any:
     """Return a if `condition` else b, both ``int64``, without a branch."""
 
@@ -404,4 +402,5 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray[Any, Any]:
     size = np.dtype(dtype).itemsize
     raw = np.empty(count * size + 64, np.uint8)
     start = -raw.ctypes.data % 64
-    return raw[start : start + count * size].view(dtype).reshape(shape)
+    part: np.ndarray[Any, Any] = raw[start : start + count * size].view(dtype).reshape(shape)
+    return part

@@ -8,6 +8,8 @@ nearest row that has some (the upper of equals).
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,9 +22,7 @@ __all__ = ["FILLS", "fill"]
 FILLS = ("background", "nearest")
 
 
-def fill(
-    disparity: NDArray[np.float32], mode: str = "background", *, threads: int = 1
-) -> NDArray[np.float32]:
+def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: int = 1) -> NDArray[np.float32]:
     """Return a copy of the map without gaps.
 
     Parameters
@@ -52,7 +52,7 @@ def fill(
     out = np.array(disparity, np.float32, order="C")
     nearest = mode == "nearest"
     parts = spans(out.shape[0], threads)
-    run([lambda y0=y0, y1=y1: _fill_rows(out, y0, y1, nearest) for y0, y1 in parts], threads)  # type: ignore[misc]
+    run([partial(_fill_rows, out, y0, y1, nearest) for y0, y1 in parts], threads)
     _fill_empty_rows(out)
     return out
 

@@ -49,7 +49,9 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
 
 
 @kernel
-def _median_of_valid(source: NDArray[np.float32], half: int, held: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+def _median_of_valid(
+    source: NDArray[np.float32], half: int, held: NDArray[np.float32], out: NDArray[np.float32]
+) -> None:
     height, width = source.shape
     for y in range(height):
         for x in range(width):

@@ -8,6 +8,7 @@ pixels whose match lies outside the right image.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -48,8 +49,7 @@ def single_matching_phase(
     cost = np.ascontiguousarray(cost)
     parts = spans(out.shape[0], threads)
     owners = np.empty((len(parts), out.shape[1]), np.int64)
-    tasks = [lambda k=k, y=y: _resolve(out, cost, *y, owners[k]) for k, y in enumerate(parts)]  # type: ignore[misc]
-    run(tasks, threads)
+    run([partial(_resolve, out, cost, y0, y1, owners[k]) for k, (y0, y1) in enumerate(parts)], threads)
     return out
 
 

@@ -8,6 +8,8 @@ regions of few pixels become invalid. Regions are found by union-find over the r
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,17 +55,17 @@ def remove_speckles(
     limit = np.float32(check_number("difference", difference, 0, 1e6))
     out = np.array(disparity, np.float32, order="C")
     held = workspace or Workspace()
-    label, parent, count = (
-        held.array(f"speckle.{name}", out.size, np.int32) for name in ("label", "parent", "count")
-    )
+    label, parent, count = (held.array(f"speckle.{name}", out.size, np.int32) for name in ("label", "parent", "count"))
     width = out.shape[1]
     parts = spans(out.shape[0], threads)
-    run([lambda y=y: _find_regions(out, *y, limit, label, parent, count) for y in parts], threads)  # type: ignore[misc]
+    run([partial(_find_regions, out, y0, y1, limit, label, parent, count) for y0, y1 in parts], threads)
     for y0, _ in parts[1:]:
         _join_rows(out, y0, limit, label, parent, count)
     flat = out.reshape(-1)
-    tasks = [lambda y=y: _erase(flat, y[0] * width, y[1] * width, size, label, parent, count) for y in parts]  # type: ignore[misc]
-    run(tasks, threads)
+    run(
+        [partial(_erase, flat, y0 * width, y1 * width, size, label, parent, count) for y0, y1 in parts],
+        threads,
+    )
     return out
 
 

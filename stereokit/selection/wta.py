@@ -51,7 +51,7 @@ class Wta:
 
 @inline
 def _best_level(keys: NDArray[Any], at: int, blocks: tuple[int, ...]) -> tuple[Any, int]:
-    """The smallest key of the levels from `at` on, and the first level that has it."""
+    """Return the smallest key of the levels from `at` on, and the first level that has it."""
     smallest = load(keys, at)
     for n in range(1, len(blocks)):
         smallest = minimum(smallest, load(keys, at + n * LANES))
@@ -66,12 +66,14 @@ def _best_level(keys: NDArray[Any], at: int, blocks: tuple[int, ...]) -> tuple[A
 
 
 @inline
-def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], to: int, out: Winners) -> None:
+def select_pixel(
+    keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], to: int, out: Winners
+) -> None:
     """Write the winner among the levels from element `at` on to element `to` of the maps.
 
     `keys` are integers in the order of `values`: `values` itself, or the bits of non-negative floats.
     """
-    key, level = _best_level(keys, at, blocks)
+    _, level = _best_level(keys, at, blocks)
     best = np.float32(values[at + level])
     disparity = np.float32(level + out.minimum)
     if out.subpixel and level > 0 and level < out.levels - 1:
@@ -92,7 +94,7 @@ def select_pixel(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tupl
 
 @inline
 def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], level: int, levels: int) -> Any:
-    """``(c2 - c1) / c2`` with c2 the lowest cost that is not next to the winner's; 1 when there is no other."""
+    """Return ``(c2 - c1) / c2`` with c2 the lowest cost that is not next to the winner's; 1 when there is no other."""
     first = max(level - 1, 0)
     behind_last = min(level + 2, levels)
     best = np.float32(values[at + level])
@@ -128,7 +130,15 @@ def winners_like(
 ) -> Winners:  # fmt: skip
     """Return the flat view of the maps that kernels write."""
     flat = np.empty(0, np.float32) if confidence is None else confidence.ravel()
-    return Winners(disparity.ravel(), cost.ravel(), flat, levels, minimum_disparity, subpixel, np.float32(uniqueness / 100))
+    return Winners(
+        disparity.ravel(),
+        cost.ravel(),
+        flat,
+        levels,
+        minimum_disparity,
+        subpixel,
+        np.float32(uniqueness / 100),
+    )
 
 
 def select(
@@ -159,8 +169,7 @@ def select(
     """
     if volume.ndim != 3 or volume.dtype not in (np.uint16, np.int16, np.float32) or 0 in volume.shape:
         raise InputError(
-            f"volume must be a non-empty (H, W, D) array of uint16, int16 or float32, "
-            f"got {volume.dtype} {volume.shape}"
+            f"volume must be a non-empty (H, W, D) array of uint16, int16 or float32, got {volume.dtype} {volume.shape}"
         )
     height, width, count = volume.shape
     padded = -(-count // LANES) * LANES

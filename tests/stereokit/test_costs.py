@@ -105,7 +105,9 @@ def test_zncc_of_a_window_without_variance_is_the_worst(random_pair):
 def test_zncc_of_equal_and_of_inverted_images():
     left = np.random.default_rng(9).integers(0, 256, (9, 16), dtype=np.uint8)
     assert (cost_volume(left, left, "zncc", **options(0, 1)) == 0).all()
-    assert (cost_volume(left, 255 - left, "zncc", steps=63, **options(0, 1)) == 63).all()  # 1 - rho = 2, clipped
+    assert (
+        cost_volume(left, 255 - left, "zncc", steps=63, **options(0, 1)) == 63
+    ).all()  # 1 - rho = 2, clipped
 
 
 @pytest.mark.parametrize("power", [0, 1, 3])

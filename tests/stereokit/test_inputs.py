@@ -29,7 +29,9 @@ def pair_of(shape=(13, 30), seed=0, dtype=np.uint8, high=256):
 def test_types_that_hold_the_same_values_give_the_same_map(method, dtype):
     left, right = pair_of()
     expected = match(left, right, method, max_disparity=16)
-    np.testing.assert_array_equal(match(left.astype(dtype), right.astype(dtype), method, max_disparity=16), expected)
+    np.testing.assert_array_equal(
+        match(left.astype(dtype), right.astype(dtype), method, max_disparity=16), expected
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -45,7 +47,9 @@ def test_floats_that_hold_16_bits_give_the_map_of_16_bits(dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize(("gain", "offset"), [(1 / 256, 0), (1024, -5), (2.0**100, 0), (-1, 0), (2.0**-60, 0)])
+@pytest.mark.parametrize(
+    ("gain", "offset"), [(1 / 256, 0), (1024, -5), (2.0**100, 0), (-1, 0), (2.0**-60, 0)]
+)
 def test_floats_of_any_range_are_used_in_full(dtype, gain, offset):
     # Census compares grey values: any map that keeps their order (or turns it in both images) keeps the costs.
     left, right = (np.clip(image, 1, 255) for image in pair_of(seed=2))

@@ -39,7 +39,9 @@ def staged(left, right, method, minimum, maximum, outside=1.0, subpixel=True, co
     levels = {"min_disparity": minimum, "max_disparity": maximum, "outside": outside}
     volume = cost_volume(left, right, cost_name, **levels, **{**COST[cost_name], **(cost or {})})
     options = {**AGGREGATION[method], **(aggregation or {})}
-    maker = {"census": stereokit.Census, "zncc": stereokit.Zncc}[cost_name](**{**COST[cost_name], **(cost or {})})
+    maker = {"census": stereokit.Census, "zncc": stereokit.Zncc}[cost_name](
+        **{**COST[cost_name], **(cost or {})}
+    )
     total = aggregate(volume, left, aggregation_name, cost=maker, **options)
     return select(total, min_disparity=minimum, subpixel=subpixel)
 
@@ -104,7 +106,15 @@ def test_the_whole_chain_against_loops(random_pair, method):
     total = oracles.sgm(volume, round(p1 * scale), round(p2 * scale), directions, left, 8, 0.5)
     disparity, cost, _ = oracles.select(total, -2)
     expected = oracles.fill(oracles.single_matching_phase(disparity.astype(np.float32), cost), "background")
-    options = {"p1": p1, "p2": p2, "edge": 8, "edge_factor": 0.5, "smp": True, "fill": "background", "median": 0}
+    options = {
+        "p1": p1,
+        "p2": p2,
+        "edge": 8,
+        "edge_factor": 0.5,
+        "smp": True,
+        "fill": "background",
+        "median": 0,
+    }
     levels = {"min_disparity": -2, "max_disparity": 6}
     result = Matcher(method, **in_full(method, **PLAIN, **levels, **options))(left, right)
     np.testing.assert_allclose(result.disparity, expected, atol=1e-5)
@@ -115,7 +125,14 @@ def test_the_whole_chain_against_loops(random_pair, method):
 def test_post_processing_is_consistency_speckles_filling_median(random_pair, method, mode):
     left, right = random_pair(16, 40, seed=6)
     disparity, cost, confidence = staged(left, right, method, 0, 16)
-    options = {"confidence": True, "fill": mode, "median": 3, "smp": True, "speckle": 0.01, "max_disparity": 16}
+    options = {
+        "confidence": True,
+        "fill": mode,
+        "median": 3,
+        "smp": True,
+        "speckle": 0.01,
+        "max_disparity": 16,
+    }
     result = Matcher(method, **in_full(method, **{**PLAIN, **options}))(left, right)
     kept = remove_speckles(single_matching_phase(disparity, cost), 6)  # 0.01 of 640 pixels
     np.testing.assert_array_equal(result.valid, ~np.isnan(kept))
@@ -274,7 +291,9 @@ def test_a_matcher_says_what_it_does():
 @pytest.mark.parametrize("shift", [2100, -2100])
 def test_disparities_of_thousands_of_pixels(shift):
     left, right = shifted(shift, (9, 2300))
-    disparity = match(left, right, "census+sgm", min_disparity=shift - 5, max_disparity=shift + 6, subpixel=False)
+    disparity = match(
+        left, right, "census+sgm", min_disparity=shift - 5, max_disparity=shift + 6, subpixel=False
+    )
     seen = slice(2115, -15) if shift > 0 else slice(15, 180)
     assert (disparity[:, seen] == shift).mean() > 0.99
 
@@ -300,7 +319,10 @@ def test_a_real_pair_is_matched(data_root, method):
     """Under a quarter of the pixels of Middlebury's Cones may be off by more than two (measured: see below)."""
     import cv2
 
-    files = {name: next(iter((data_root / "middlebury").glob(f"2003/cones/{name}.*")), None) for name in ("im2", "im6", "disp2")}
+    files = {
+        name: next(iter((data_root / "middlebury").glob(f"2003/cones/{name}.*")), None)
+        for name in ("im2", "im6", "disp2")
+    }
     if None in files.values():
         pytest.skip(f"no Middlebury Cones in {data_root}; set STEREOKIT_DATA")
     left, right = (cv2.imread(str(files[name]))[:, :, ::-1] for name in ("im2", "im6"))

@@ -98,7 +98,12 @@ def test_worst_costs_and_penalties_never_overflow(seed, shape, largest, share, p
 @given(seed=SEEDS, passes=st.integers(1, 5), sigma_s=st.floats(0.1, 50), sigma_r=st.floats(1, 300))
 def test_the_domain_transform_stays_between_the_extremes(seed, passes, sigma_s, sigma_r):
     volume = (np.random.default_rng(seed).integers(0, 2, (5, 8, 6)) * 254).astype(np.uint8)
-    options = {"sigma_s": sigma_s, "sigma_r": sigma_r, "passes": passes, "cost": RowCost(lambda *_: None, 254)}
+    options = {
+        "sigma_s": sigma_s,
+        "sigma_r": sigma_r,
+        "passes": passes,
+        "cost": RowCost(lambda *_: None, 254),
+    }
     total = aggregate(volume, noise(seed, 5, 8), "dt", **options)
     assert total.min() >= 0
     assert total.max() <= 254 * 128
@@ -106,7 +111,9 @@ def test_the_domain_transform_stays_between_the_extremes(seed, passes, sigma_s, 
     assert ((confidence >= 0) & (confidence <= 1)).all()
 
 
-@given(seed=SEEDS, method=st.sampled_from(METHODS), scale=st.sampled_from([1, 0.5]), contrast=st.integers(1, 256))
+@given(
+    seed=SEEDS, method=st.sampled_from(METHODS), scale=st.sampled_from([1, 0.5]), contrast=st.integers(1, 256)
+)
 def test_maps_are_dense_in_range_and_confidence_is_a_share(seed, method, scale, contrast):
     left, right = noise(seed, 13, 41, contrast), noise(seed + 1, 13, 41, contrast)
     result = Matcher(method, max_disparity=24, scale=scale, confidence=True)(left, right)
@@ -129,9 +136,18 @@ def test_post_processing_of_any_map(seed, height, width, gaps):
         np.testing.assert_array_equal(median(kept, size), oracles.median(kept, size))
 
 
-@given(seed=SEEDS, view=st.sampled_from(["rows", "columns", "both", "skip"]), dtype=st.sampled_from(["u1", "u2", "f4"]))
+@given(
+    seed=SEEDS,
+    view=st.sampled_from(["rows", "columns", "both", "skip"]),
+    dtype=st.sampled_from(["u1", "u2", "f4"]),
+)
 def test_views_are_their_copies(seed, view, dtype):
-    cut = {"rows": np.s_[::-1], "columns": np.s_[:, ::-1], "both": np.s_[::-1, ::-1], "skip": np.s_[::2, 1::2]}[view]
+    cut = {
+        "rows": np.s_[::-1],
+        "columns": np.s_[:, ::-1],
+        "both": np.s_[::-1, ::-1],
+        "skip": np.s_[::2, 1::2],
+    }[view]
     left, right = (noise(seed + k, 12, 40, 256, dtype)[cut] for k in range(2))
     expected = match(left.copy(), right.copy(), "census+sgm", max_disparity=12)  # `copy` is contiguous
     np.testing.assert_array_equal(match(left, right, "census+sgm", max_disparity=12), expected)

@@ -85,7 +85,12 @@ def test_strided_volumes(view):
 
 @pytest.mark.parametrize(
     "volume",
-    [np.zeros((2, 3), np.uint16), np.zeros((2, 3, 0), np.uint16), np.zeros((2, 3, 4), np.uint8), np.zeros((2, 3, 4))],
+    [
+        np.zeros((2, 3), np.uint16),
+        np.zeros((2, 3, 0), np.uint16),
+        np.zeros((2, 3, 4), np.uint8),
+        np.zeros((2, 3, 4)),
+    ],
 )
 def test_volumes_that_cannot_be_used(volume):
     with pytest.raises(InputError, match="volume must be"):

@@ -1,7 +1,7 @@
 """Add a third cost, the absolute difference of grey values, and match a random pair with it.
 
-A cost is one compiled function that fills one row of the cost volume. Registered under a name, it runs in every
-aggregation: "difference+sgm", "difference+dt".
+A cost is one compiled function that fills one row of the cost volume. Registered under a name, it runs in
+every aggregation: "difference+sgm", "difference+dt".
 """
 
 import numba

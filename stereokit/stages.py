@@ -90,7 +90,7 @@ def aggregate(
     Returns
     -------
     (H, W, D)
-        ``uint16`` sums over the paths for ``"sgm"``; for ``"dt"`` ``int16`` in 1/128 units of cost with
+        ``uint16`` sums over the paths for ``"sgm"``; for ``"dt"`` ``int16`` in 1/64 units of cost with
         ``mode="rf"``, ``float32`` with ``mode="sum"`` or for a float volume.
 
     Raises

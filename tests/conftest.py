@@ -1,7 +1,7 @@
 """What all tests share: the environment, the folder of real data, a helper for fresh interpreters.
 
-Compiled kernels are kept in ``.numba_cache`` in the repository unless ``NUMBA_CACHE_DIR`` is set, so that only the
-first run compiles. Thread counts are held low before numpy loads: the machines that run tests are shared.
+Compiled kernels are kept in ``.numba_cache`` in the repository unless ``NUMBA_CACHE_DIR`` is set, so that only
+the first run compiles. Thread counts are held low before numpy loads: the machines that run tests are shared.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def random_pair():
 
 @pytest.fixture(scope="session")
 def run_python():
-    """Return a function that runs python in a new process with the packages under test and returns its output."""
+    """Return a function that runs python in a new process, packages at hand, and returns its output."""
 
     def run(*arguments, timeout=300, **environment):
         import stereokit

@@ -1,8 +1,8 @@
 """Reference forms of every stage of the matching core: plain loops, written from the papers, slow and exact.
 
-Nothing here imports stereokit. Conventions that papers leave open (ties, borders, rounding) are those that the
-package documents. Disparity ``d`` of level ``k`` is ``k + minimum``; the right pixel is column ``x - d``; volumes are
-``(H, W, D)``.
+Nothing here imports stereokit. Conventions that papers leave open (ties, borders, rounding) are those that
+the package documents. Disparity ``d`` of level ``k`` is ``k + minimum``; the right pixel is column ``x - d``;
+volumes are ``(H, W, D)``.
 
 References
 ----------
@@ -32,7 +32,7 @@ def _clamped(image, y, x):
 
 
 def _volume(left, right, minimum, count, cost, outside, dtype):
-    """Fill a volume with ``cost(y, x, xr)``; cells whose right pixel is outside get `outside` unless it is None."""
+    """Fill a volume with ``cost(y, x, xr)``; cells to the side of the image get `outside`, if not None."""
     height, width = left.shape
     volume = np.empty((height, width, count), dtype)
     for y in range(height):
@@ -52,7 +52,7 @@ def census_bits(image, y, x, across, down):
 
 
 def census(left, right, minimum, count, width=9, height=7, outside=1.0):
-    """Hamming distances of census transforms; `outside` is a share of the largest, or None for clamped borders."""
+    """Hamming distances of census transforms; `outside` is a share of the largest, None clamps borders."""
     across, down = width // 2, height // 2
     largest = width * height - 1
     held = {}
@@ -139,9 +139,7 @@ def domain_transform(plane, guide, sigma_s, sigma_r, passes, sigma_v=None):
             sigma = scale * math.sqrt(3) * 2.0 ** (passes - i) / math.sqrt(4.0**passes - 1)
             a = math.exp(-math.sqrt(2) / sigma)
             for line, edge in zip(image, edges, strict=True):
-                weight = [
-                    a ** (1 + scale / sigma_r * abs(edge[n] - edge[n - 1])) for n in range(1, len(line))
-                ]
+                weight = [a ** (1 + scale / sigma_r * abs(edge[n] - edge[n - 1])) for n in range(1, len(line))]
                 for n in range(1, len(line)):
                     line[n] += weight[n - 1] * (line[n - 1] - line[n])
                 for n in range(len(line) - 2, -1, -1):
@@ -150,7 +148,7 @@ def domain_transform(plane, guide, sigma_s, sigma_r, passes, sigma_v=None):
 
 
 def cascade(plane, guide):
-    """Plain sum of the StereoVAE authors: right, left, down, up, each on what the one before left, float64."""
+    """Plain sum of the StereoVAE authors: right, left, down, up, each on what the last one left, float64."""
     values = np.array(plane, np.float64)
     grey = np.array(guide, np.int64)
     height, width = values.shape
@@ -178,7 +176,7 @@ def slices(filter_plane, volume, *arguments):
 
 
 def winner(costs, minimum=0, subpixel=True):
-    """Return ``(disparity, cost, confidence)`` of one pixel: lowest cost, the lowest level of equals, a parabola."""
+    """Return ``(disparity, cost, confidence)`` of one pixel: the lowest level of equals, a parabola."""
     costs = [float(c) for c in costs]
     best = min(costs)
     level = costs.index(best)
@@ -202,7 +200,7 @@ def select(volume, minimum=0, subpixel=True):
 
 
 def single_matching_phase(disparity, cost):
-    """Keep the cheapest of all pixels whose match rounds to one right pixel; of equals the larger disparity."""
+    """Keep the cheapest of all pixels that match one right pixel (rounded); of equals the larger disparity."""
     height, width = disparity.shape
     out = np.full(disparity.shape, np.nan)
     for y in range(height):
@@ -218,7 +216,7 @@ def single_matching_phase(disparity, cost):
 
 
 def fill(disparity, mode):
-    """Fill gaps along rows, then rows without any value from the nearest row that has some (upper of equals)."""
+    """Fill gaps along rows, then rows without any value from the nearest that has some (upper of equals)."""
     out = np.array(disparity, np.float64)
     full = []
     for y, row in enumerate(disparity):
@@ -257,7 +255,7 @@ def median(disparity, size):
 
 
 def remove_speckles(disparity, size, difference=1.0):
-    """Invalidate 4-connected regions of `size` pixels or fewer; neighbours differ by `difference` at most, in 1/16."""
+    """Invalidate 4-connected regions of `size` pixels or fewer, by differences in sixteenths of a pixel."""
     height, width = disparity.shape
     out = np.array(disparity, np.float64)
     valid = [(y, x) for y in range(height) for x in range(width) if not math.isnan(disparity[y, x])]
@@ -315,8 +313,6 @@ def double(image, height, width):
     for y in range(height):
         for x in range(width):
             out[y, x] = sum(
-                a * b * float(image[j, i])
-                for j, a in weights(y, image.shape[0])
-                for i, b in weights(x, image.shape[1])
+                a * b * float(image[j, i]) for j, a in weights(y, image.shape[0]) for i, b in weights(x, image.shape[1])
             )
     return out

@@ -134,17 +134,14 @@ def scenes(count: int = 20) -> list[Frame]:
     def part(index: int, take: Callable[[Any], NDArray[Any]]) -> Loader:
         return lambda: take(_scene(index))
 
-    def seen(scene: Any) -> NDArray[np.float32]:
-        disparity: NDArray[np.float32] = np.where(scene.occluded, np.float32(np.nan), scene.disparity)
-        return disparity
-
     return [
         Frame(
             f"scene_{index:03d}",
             part(index, lambda scene: scene.left),
             part(index, lambda scene: scene.right),
-            noc=part(index, seen),
-            occ=part(index, lambda scene: scene.disparity),
+            noc=part(index, lambda scene: scene.noc),
+            occ=part(index, lambda scene: scene.occ),
+            objects=part(index, lambda scene: scene.objects),
         )
         for index in range(count)
     ]

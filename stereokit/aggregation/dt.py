@@ -15,7 +15,7 @@ Rows are filtered as the cost produces them and written to the one volume; then 
 down and up, and the upward sweep selects as it goes. Rows and bands are independent of one another, so any number
 of threads gives the same result.
 
-``rf`` runs in 16-bit fixed point, costs with 7 fractional bits and weights with 15, and the volume between rows and
+``rf`` runs in 16-bit fixed point, costs with 6 fractional bits and weights with 15, and the volume between rows and
 columns holds bytes, costs with as many fractional bits as fit: a quarter of the memory of floats and the same result
 on every processor. The rounding stays below half a unit of cost and was measured to leave the error where it is.
 ``sum`` grows without bound and runs in float32. `stereokit.aggregate` takes float volumes too and filters them in
@@ -45,7 +45,7 @@ from stereokit.kernels.simd import (
     load,
     minimum,
     multiply,
-    multiply_q15,
+    multiply_high,
     shift_left,
     shift_right,
     splat,
@@ -68,8 +68,9 @@ class Weights(NamedTuple):
     shift: int  # fixed point: the volume's bytes hold `_FRACTION_BITS - shift` fractional bits
 
 
-_FRACTION_BITS = 7
-"""Fixed-point costs: fractional bits while a row or column is filtered. Costs reach 255: that is what int16 leaves."""
+_FRACTION_BITS = 6
+"""Fixed-point costs: fractional bits while a row or column is filtered. Costs reach 255, and twice
+a difference must fit int16."""
 
 
 @AGGREGATIONS.register("dt")
@@ -121,7 +122,7 @@ class Dt:
         if self.mode == "sum":
             row, column = edge_weights()
             return [Weights(row, column, np.zeros(1, np.float32), 0)]
-        shift = _FRACTION_BITS - (8 - int(cost_max).bit_length())
+        shift = max(0, _FRACTION_BITS - (8 - int(cost_max).bit_length()))
         return [
             Weights(
                 self._table(self.sigma_s, i, dtype),
@@ -203,7 +204,9 @@ def _feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
 @overload(_feed_back, strict=False, jit_options={"forceinline": True})
 def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     if value.scalar == types.int16:
-        return lambda value, before, weight, keep: add(value, multiply_q15(subtract(before, value), weight))
+        return lambda value, before, weight, keep: add(
+            value, multiply_high(shift_left(subtract(before, value), 1), weight)
+        )
     return lambda value, before, weight, keep: add(value, multiply(weight, subtract(before, multiply(keep, value))))
 
 

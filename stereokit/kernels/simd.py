@@ -44,7 +44,7 @@ __all__ = [
     "maximum",
     "minimum",
     "multiply",
-    "multiply_q15",
+    "multiply_high",
     "shift_down",
     "shift_left",
     "shift_right",
@@ -189,16 +189,10 @@ def _most_float(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
     return builder.select(builder.fcmp_ordered(">", x, y), x, y)
 
 
-def _q15(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
+def _high(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
     wide = ir.VectorType(_I32, LANES)
-
-    def constant(value: int) -> Any:
-        return ir.Constant(wide, [value] * LANES)
-
-    product = builder.mul(builder.sext(x, wide), builder.sext(y, wide))
-    # The form in which LLVM recognises one instruction of x86: ((product >> 14) + 1) >> 1.
-    rounded = builder.lshr(builder.add(builder.lshr(product, constant(14)), constant(1)), constant(1))
-    return builder.trunc(rounded, kind.llvm)
+    product = builder.mul(builder.sext(x, wide), builder.sext(y, wide))  # with the shift: one instruction on most
+    return builder.trunc(builder.lshr(product, ir.Constant(wide, [16] * LANES)), kind.llvm)
 
 
 add = _binary("add", "Return a + b, wrapping.", lambda b, k, x, y: b.add(x, y), lambda b, k, x, y: b.fadd(x, y))
@@ -208,9 +202,7 @@ subtract = _binary(
 multiply = _binary(
     "multiply", "Return a * b, wrapping.", lambda b, k, x, y: b.mul(x, y), lambda b, k, x, y: b.fmul(x, y)
 )
-multiply_q15 = _binary(
-    "multiply_q15", "Return (a * b + 2**14) >> 15 of int16 lanes: b is a factor in [0, 1) times 2**15.", _q15
-)
+multiply_high = _binary("multiply_high", "Return (a * b) >> 16 of int16 lanes, rounded down.", _high)
 add_saturated = _binary(
     "add_saturated", "Return a + b, held at the type's largest value.", _llvm("uadd.sat", "sadd.sat")
 )

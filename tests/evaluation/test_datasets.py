@@ -239,11 +239,11 @@ def test_scenes_are_adapted_and_drawn_once(monkeypatch):
 
     def generate(index, width, height):
         drawn.append(index)
-        disparity = np.full((height, width), 5.0 + index, np.float32)
-        occluded = np.zeros((height, width), bool)
-        occluded[:, :5] = True
+        occ = np.full((height, width), 5.0 + index, np.float32)
+        noc = occ.copy()
+        noc[:, :5] = np.nan
         image = np.full((height, width), index, np.uint8)
-        return SimpleNamespace(left=image, right=image + 1, disparity=disparity, occluded=occluded)
+        return SimpleNamespace(left=image, right=image + 1, occ=occ, noc=noc, objects=image)
 
     monkeypatch.setitem(sys.modules, "stereokit_evaluation.scenes", SimpleNamespace(generate=generate))
     datasets._scene.cache_clear()

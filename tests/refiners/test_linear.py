@@ -73,9 +73,7 @@ def test_half_size_matching_is_matching_halved_images_and_upscaling(size):
     # Multiples of four: the mean of four pixels is whole, whichever way halves are rounded.
     left, right = (rng.integers(0, 64, size).astype(np.uint8) * 4 for _ in range(2))
     options = {"confidence": True, "smp": True, "median": 3, "smooth": 0.5}
-    result = stereokit.Matcher("census+sgm", max_disparity=31, min_disparity=-3, scale=0.5, **options)(
-        left, right
-    )
+    result = stereokit.Matcher("census+sgm", max_disparity=31, min_disparity=-3, scale=0.5, **options)(left, right)
     halves = (oracles.halve(image).astype(np.uint8) for image in (left, right))
     coarse = stereokit.Matcher("census+sgm", max_disparity=16, min_disparity=-2, **options)(*halves)
     fine = Linear()(coarse, left)

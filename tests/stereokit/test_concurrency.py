@@ -32,9 +32,7 @@ def test_the_result_does_not_depend_on_threads(method, scale):
     pair = pair_of(0)
     one = Matcher(method, max_disparity=16, threads=1, confidence=True, scale=scale)(*pair)
     for threads in (2, 3, 8, 100):
-        assert_same(
-            one, Matcher(method, max_disparity=16, threads=threads, confidence=True, scale=scale)(*pair)
-        )
+        assert_same(one, Matcher(method, max_disparity=16, threads=threads, confidence=True, scale=scale)(*pair))
 
 
 @pytest.mark.parametrize("options", [{"paths": 4}, {"paths": 5}])

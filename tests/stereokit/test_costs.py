@@ -105,9 +105,7 @@ def test_zncc_of_a_window_without_variance_is_the_worst(random_pair):
 def test_zncc_of_equal_and_of_inverted_images():
     left = np.random.default_rng(9).integers(0, 256, (9, 16), dtype=np.uint8)
     assert (cost_volume(left, left, "zncc", **options(0, 1)) == 0).all()
-    assert (
-        cost_volume(left, 255 - left, "zncc", steps=63, **options(0, 1)) == 63
-    ).all()  # 1 - rho = 2, clipped
+    assert (cost_volume(left, 255 - left, "zncc", steps=63, **options(0, 1)) == 63).all()  # 1 - rho = 2, clipped
 
 
 @pytest.mark.parametrize("power", [0, 1, 3])
@@ -200,10 +198,14 @@ def test_a_row_cost_without_a_cost_for_outside_takes_the_border_pixel(random_pai
     np.testing.assert_array_equal(volume, np.minimum(difference, 60))
 
 
-@pytest.mark.parametrize("method", ["difference+sgm", "difference+dt"])
-def test_a_row_cost_runs_in_every_aggregation(method, added_cost):
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [("difference+sgm", {"p1": 7, "p2": 190, "paths": 8}), ("difference+dt", {"sigma_s": 9.0})],
+)
+def test_a_row_cost_runs_in_every_aggregation(method, options, added_cost):
     left = np.random.default_rng(16).integers(0, 256, (12, 40), dtype=np.uint8)
-    disparity = stereokit.match(left, np.roll(left, -5, axis=1), method, max_disparity=16, subpixel=False)
+    options = {"max_disparity": 16, "subpixel": False, "smooth": 0, **options}
+    disparity = stereokit.match(left, np.roll(left, -5, axis=1), method, **options)
     assert (disparity[:, 10:] == 5).all()
 
 

@@ -1,7 +1,7 @@
 """Domain transform against loops written from Gastal and Oliveira 2011, and against OpenCV's own filter.
 
-``dtfilter_vector.json`` holds what ``cv2.ximgproc.dtFilter`` of opencv-contrib returned; the call and the versions
-stand in it (opencv-contrib cannot be installed beside the plain opencv that stereokit uses).
+``dtfilter_vector.json`` holds what ``cv2.ximgproc.dtFilter`` of opencv-contrib returned; the call and the
+versions stand in it (opencv-contrib cannot be installed beside the plain opencv that stereokit uses).
 """
 
 from __future__ import annotations
@@ -48,9 +48,7 @@ def test_float_volumes_are_filtered_as_the_paper_says(shape, passes):
         np.testing.assert_allclose(total, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "case", VECTOR["results"], ids=lambda c: f"{c['passes']}-{c['sigma_s']}-{c['sigma_r']}"
-)
+@pytest.mark.parametrize("case", VECTOR["results"], ids=lambda c: f"{c['passes']}-{c['sigma_s']}-{c['sigma_r']}")
 def test_float_volumes_are_filtered_as_opencv_does(case):
     volume = np.array(VECTOR["source"], np.float32)[:, :, None]
     guide = np.array(VECTOR["guide"], np.uint8)
@@ -59,9 +57,7 @@ def test_float_volumes_are_filtered_as_opencv_does(case):
     np.testing.assert_allclose(total[:, :, 0], np.array(case["output"]), rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "case", VECTOR["results"], ids=lambda c: f"{c['passes']}-{c['sigma_s']}-{c['sigma_r']}"
-)
+@pytest.mark.parametrize("case", VECTOR["results"], ids=lambda c: f"{c['passes']}-{c['sigma_s']}-{c['sigma_r']}")
 def test_the_oracle_is_opencv(case):
     plane = oracles.domain_transform(
         VECTOR["source"], VECTOR["guide"], case["sigma_s"], case["sigma_r"], case["passes"]

@@ -10,9 +10,7 @@ import stereokit
 
 
 def test_importing_loads_neither_torch_nor_cuda_nor_skimage(run_python):
-    names = json.loads(
-        run_python("-c", "import json, sys, stereokit; print(json.dumps(sorted(sys.modules)))")
-    )
+    names = json.loads(run_python("-c", "import json, sys, stereokit; print(json.dumps(sorted(sys.modules)))"))
     heavy = ("torch", "skimage", "numba.cuda", "stereokit_refiners", "stereokit_evaluation")
     assert "numpy" in names
     loaded = [name for name in names if any(name == h or name.startswith(h + ".") for h in heavy)]

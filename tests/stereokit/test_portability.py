@@ -1,6 +1,7 @@
 """The result does not depend on the processor: kernels compiled for lesser ones give the same bits.
 
-numba compiles for what ``NUMBA_CPU_NAME`` and ``NUMBA_CPU_FEATURES`` say; each setting runs in a process of its own.
+numba compiles for what ``NUMBA_CPU_NAME`` and ``NUMBA_CPU_FEATURES`` say; each setting runs in a process of
+its own.
 """
 
 from __future__ import annotations
@@ -37,9 +38,7 @@ def test_a_processor_without_any_extension_gives_the_same_bits(run_python, nativ
 
 
 def test_a_processor_with_avx2_and_no_more_gives_the_same_bits(run_python, native):
-    if platform.machine() not in ("x86_64", "AMD64") or not llvmlite.binding.get_host_cpu_features().get(
-        "avx2"
-    ):
+    if platform.machine() not in ("x86_64", "AMD64") or not llvmlite.binding.get_host_cpu_features().get("avx2"):
         pytest.skip("needs a processor with AVX2")
     assert run_python("-c", SCRIPT, NUMBA_CPU_NAME="haswell", NUMBA_CPU_FEATURES="") == native
 

@@ -53,9 +53,7 @@ def test_matches_outside_the_right_image_are_invalid():
     cost = np.zeros((1, 4), np.uint16)
     np.testing.assert_array_equal(single_matching_phase(row(1, NAN, 2, -1), cost), row(NAN, NAN, 2, NAN))
     # The match of column 0 at 0.5 rounds to column 0 and that of column 3 at -0.5 to column 4.
-    np.testing.assert_array_equal(
-        single_matching_phase(row(0.5, NAN, NAN, -0.5), cost), row(0.5, NAN, NAN, NAN)
-    )
+    np.testing.assert_array_equal(single_matching_phase(row(0.5, NAN, NAN, -0.5), cost), row(0.5, NAN, NAN, NAN))
 
 
 @pytest.mark.parametrize("shape", SHAPES)

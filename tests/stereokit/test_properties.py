@@ -54,9 +54,7 @@ def test_zncc_does_not_change_under_gain_and_offset(seed, gains, offsets):
     left, right = noise(seed, 11, 23, 110, np.uint16), noise(seed + 1, 11, 23, 110, np.uint16)
     right[:, :-3] = (left[:, 3:] + right[:, :-3]) // 2
     plain = cost_volume(left, right, "zncc", window=5, max_disparity=9).astype(int)
-    moved = cost_volume(
-        left * gains[0] + offsets[0], right * gains[1] + offsets[1], "zncc", window=5, max_disparity=9
-    )
+    moved = cost_volume(left * gains[0] + offsets[0], right * gains[1] + offsets[1], "zncc", window=5, max_disparity=9)
     assert abs(moved - plain).max() <= 1  # float32 may fall on either side of a half,
     assert (moved != plain).mean() < 0.01  # which is rare
 
@@ -74,8 +72,8 @@ def test_census_does_not_change_under_monotone_maps(seed, window, data):
 
 @given(
     seed=SEEDS,
-    shape=st.tuples(st.integers(1, 4), st.integers(1, 5), st.integers(1, 130)),
-    largest=st.integers(1, 254),
+    shape=st.tuples(st.integers(1, 4), st.integers(1, 5), st.sampled_from([1, 2, 9, 63, 64, 65, 128])),
+    largest=st.sampled_from([1, 30, 62, 120, 254]),  # of few sizes of the sums: each compiles kernels of its own
     share=st.floats(0, 1),
     paths=st.sampled_from([4, 5, 8]),
 )
@@ -111,9 +109,7 @@ def test_the_domain_transform_stays_between_the_extremes(seed, passes, sigma_s, 
     assert ((confidence >= 0) & (confidence <= 1)).all()
 
 
-@given(
-    seed=SEEDS, method=st.sampled_from(METHODS), scale=st.sampled_from([1, 0.5]), contrast=st.integers(1, 256)
-)
+@given(seed=SEEDS, method=st.sampled_from(METHODS), scale=st.sampled_from([1, 0.5]), contrast=st.integers(1, 256))
 def test_maps_are_dense_in_range_and_confidence_is_a_share(seed, method, scale, contrast):
     left, right = noise(seed, 13, 41, contrast), noise(seed + 1, 13, 41, contrast)
     result = Matcher(method, max_disparity=24, scale=scale, confidence=True)(left, right)

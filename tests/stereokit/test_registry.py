@@ -49,11 +49,9 @@ def test_a_name_is_given_once(registry):
 def test_unknown_names_suggest_the_nearest(registry):
     registry.register("hammer")(1)
     registry.register("saw")(2)
-    with pytest.raises(
-        UnknownNameError, match="no tool named 'hamer'; did you mean 'hammer'.* Known: hammer, saw"
-    ):
+    with pytest.raises(UnknownNameError, match=r"no tool named 'hamer'; did you mean 'hammer'.* Known: hammer, saw"):
         registry.get("hamer")
-    with pytest.raises(UnknownNameError, match="no tool named 'x'. Known: hammer, saw"):
+    with pytest.raises(UnknownNameError, match=r"no tool named 'x'\. Known: hammer, saw"):
         registry.get("x")
 
 

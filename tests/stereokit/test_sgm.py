@@ -47,9 +47,7 @@ def test_every_number_of_levels(count):
     np.testing.assert_array_equal(sums(volume, 62, 9, 193), expected)
 
 
-@pytest.mark.parametrize(
-    ("p1", "p2"), [(0, 0), (0, 40), (40, 40), (85, 85), (86, 86), (127, 128), (193, 193)]
-)
+@pytest.mark.parametrize(("p1", "p2"), [(0, 0), (0, 40), (40, 40), (85, 85), (86, 86), (127, 128), (193, 193)])
 def test_penalties_of_every_size(p1, p2):
     volume = volume_of((5, 6), 12, 62, seed=2)
     expected = oracles.sgm(volume, p1, p2, oracles.DIRECTIONS[8])
@@ -82,9 +80,7 @@ def test_512_levels():
 
 
 @pytest.mark.parametrize("paths", [4, 5, 8])
-@pytest.mark.parametrize(
-    ("edge", "edge_factor"), [(8, 0.5), (100, 0.3), (0, 0.5), (128, 0), (256, 0.5), (1e6, 0)]
-)
+@pytest.mark.parametrize(("edge", "edge_factor"), [(8, 0.5), (100, 0.3), (0, 0.5), (128, 0), (256, 0.5), (1e6, 0)])
 def test_penalties_are_lower_across_edges_of_the_guide(paths, edge, edge_factor):
     volume = volume_of((5, 6), 10, 62, seed=9)
     guide = guide_of((5, 6), 9) // 2  # differences of 0 to 127

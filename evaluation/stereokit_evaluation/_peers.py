@@ -1,0 +1,130 @@
+"""Those who are timed by ``stereokit bench``: our methods, and the libraries that people use instead.
+
+A peer is a name, the module that it needs and a factory; it takes part only when that module can be imported. All
+take two grey ``uint8`` images and are called as their users call them: OpenCV's matchers get the whole image without
+padding (which costs them the leftmost columns, not time), their usual penalties for block size 5, a uniqueness
+ratio, the left-right check and no speckle filter. Only peers that were run here are listed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import UnknownNameError, did_you_mean
+from stereokit.matching import METHODS, Matcher, parse_method
+
+__all__ = ["HH", "PEERS", "THREE_WAY", "Call", "Peer", "label", "make", "peers", "usable_levels"]
+
+Call = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[Any]]
+"""Left and right image, both (H, W) uint8, to a disparity map."""
+
+HH, THREE_WAY = "OpenCV HH", "OpenCV 3WAY"
+
+_BLOCK = 5
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A matcher of another library.
+
+    Attributes
+    ----------
+    name : str
+        As the table calls it.
+    module : str
+        What must be importable.
+    make : callable
+        Takes the number of disparity levels and returns the call that is timed.
+    bytes_per_cell : int
+        Known memory per pixel and level, to leave it out where the machine cannot hold it; 0 if little or unknown.
+    """
+
+    name: str
+    module: str
+    make: Callable[[int], Call]
+    bytes_per_cell: int = 0
+
+
+def _opencv(mode: int) -> Callable[[int], Call]:
+    def build(levels: int) -> Call:
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=0,
+            numDisparities=usable_levels(levels),
+            blockSize=_BLOCK,
+            P1=8 * _BLOCK * _BLOCK,
+            P2=32 * _BLOCK * _BLOCK,
+            disp12MaxDiff=1,
+            preFilterCap=63,
+            uniquenessRatio=5,
+            speckleWindowSize=0,
+            speckleRange=0,
+            mode=mode,
+        )
+        return matcher.compute
+
+    return build
+
+
+# The full modes keep two volumes of int16, costs and sums, for the whole image.
+PEERS: dict[str, Peer] = {
+    peer.name: peer
+    for peer in (
+        Peer("OpenCV SGBM", "cv2", _opencv(cv2.STEREO_SGBM_MODE_SGBM)),
+        Peer(THREE_WAY, "cv2", _opencv(cv2.STEREO_SGBM_MODE_SGBM_3WAY)),
+        Peer(HH, "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH), 4),
+        Peer("OpenCV HH4", "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH4), 4),
+    )
+}
+"""Peers by name: OpenCV's semi-global matcher in 5, 3, 8 and 4 directions."""
+
+
+def peers() -> list[str]:
+    """Return the names of the peers whose module is installed."""
+    return [peer.name for peer in PEERS.values() if find_spec(peer.module) is not None]
+
+
+def usable_levels(levels: int) -> int:
+    """Return the levels that OpenCV takes for `levels`: the next multiple of 16."""
+    return -(-levels // 16) * 16
+
+
+def label(key: str) -> str:
+    """Return what the table calls a contender: a peer's name, or such as ``"S2 census+sgm"``."""
+    if key in PEERS:
+        return key
+    return " ".join([*(short for short, name in METHODS.items() if name == key), key])
+
+
+def make(key: str, levels: int, threads: int) -> Call:
+    """Return the call to time.
+
+    Parameters
+    ----------
+    key : str
+        A peer's name, or a method of stereokit, which runs with its default options.
+    levels : int
+        Disparities 0 to `levels` - 1.
+    threads : int
+        Threads of our methods. OpenCV's are a setting of the process, ``cv2.setNumThreads``.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such peer or method.
+    """
+    if key in PEERS:
+        return PEERS[key].make(levels)
+    try:
+        matcher = Matcher(parse_method(key), max_disparity=levels, threads=threads)
+    except UnknownNameError as error:
+        if "+" in key or key.upper() in METHODS:
+            raise
+        raise UnknownNameError(did_you_mean("method", key, [*METHODS, *METHODS.values(), *PEERS])) from error
+    return lambda left, right: matcher(left, right).disparity

@@ -1,0 +1,136 @@
+"""Where the time of a call goes, stage by stage, without a line of it in the core.
+
+While it runs, the functions that `stereokit.matching` calls (input checks, smoothing, post-processing), the cost's
+``prepare``, the aggregation's ``sweep`` and the kernels that the sweep calls are replaced by timed stand-ins. They
+are found by what they are, not by name: a function that the core renames shows under its new name, and what is not
+found stays in "other". Times are exclusive: a stage does not count the stages inside it.
+
+The calls run on one thread. Nothing else in the process may match at the same time.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit import matching
+
+__all__ = ["OTHER", "TOTAL", "stage_times"]
+
+OTHER, TOTAL = "other", "total"
+
+_STAGES = ("stereokit.inputs", "stereokit.postprocess", "stereokit.selection")
+
+
+class _Watch:
+    """Seconds by stage of one call; stages nest."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self.clock = clock
+        self.seconds: dict[str, float] = {}
+        self._inner: list[float] = []  # time of the stages inside each one that is under way
+
+    def wrap(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(function)
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            self.seconds.setdefault(name, 0.0)  # here, so that stages stand in the order in which they begin
+            self._inner.append(0.0)
+            begun = self.clock()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                took = self.clock() - begun
+                self.seconds[name] += took - self._inner.pop()
+                if self._inner:
+                    self._inner[-1] += took
+
+        return timed
+
+
+def stage_times(
+    method: str,
+    levels: int,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    rounds: int,
+    *,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float]:
+    """Return the median milliseconds of each stage of a method with default options on one thread.
+
+    Parameters
+    ----------
+    method : str
+        A method's name.
+    levels : int
+        Disparities 0 to `levels` - 1.
+    left, right : (H, W) uint8
+        Images.
+    rounds : int
+        Calls, 1 or more, after one that compiles.
+    clock : callable
+        Returns seconds.
+
+    Returns
+    -------
+    dict of str to float
+        Stages in the order in which they first begin, then `OTHER`, what no stage accounts for, and `TOTAL`.
+    """
+    matcher = matching.Matcher(method, max_disparity=levels, threads=1)
+    matcher(left, right)  # compiled before names are replaced: a kernel that is not must not see the stand-ins
+    rows: list[dict[str, float]] = []
+    for _ in range(rounds):
+        watch = _Watch(clock)
+        with _watched(matcher, watch):
+            begun = clock()
+            matcher(left, right)
+            total = clock() - begun
+        rows.append({**watch.seconds, OTHER: total - sum(watch.seconds.values()), TOTAL: total})
+    names = [name for name in rows[0] if name not in (OTHER, TOTAL)]
+    return {name: 1e3 * float(np.median([row.get(name, 0.0) for row in rows])) for name in (*names, OTHER, TOTAL)}
+
+
+@contextmanager
+def _watched(matcher: Any, watch: _Watch) -> Iterator[None]:
+    """Replace the stages of `matcher` by timed ones, and put them back."""
+    replaced: list[tuple[Any, str, Any]] = []
+    try:
+        for owner, attribute, name in _targets(matcher):
+            original = vars(owner)[attribute]
+            setattr(owner, attribute, watch.wrap(name, original))
+            replaced.append((owner, attribute, original))
+        yield
+    finally:
+        for owner, attribute, original in reversed(replaced):
+            setattr(owner, attribute, original)
+
+
+def _targets(matcher: Any) -> list[tuple[Any, str, str]]:
+    """Return where each stage's name is looked up: owner, attribute and the name to report."""
+    found: list[tuple[Any, str, str]] = []
+    for attribute, value in vars(matching).items():
+        if isinstance(value, FunctionType) and value.__module__.startswith(_STAGES):
+            found.append((matching, attribute, _words(attribute)))
+    for stage, attribute, name in (
+        (getattr(matcher, "cost", None), "prepare", "prepare cost"),
+        (getattr(matcher, "aggregation", None), "sweep", "sweep, around its kernels"),
+    ):
+        if isinstance(vars(type(stage)).get(attribute), FunctionType):
+            found.append((type(stage), attribute, name))
+    home = sys.modules.get(type(getattr(matcher, "aggregation", None)).__module__)
+    for attribute, value in list(vars(home).items()) if home is not None else []:
+        if getattr(value, "signatures", None) and hasattr(value, "py_func"):  # a kernel that Python has called
+            found.append((home, attribute, f"sweep: {_words(attribute)}"))
+    return found
+
+
+def _words(name: str) -> str:
+    return name.strip("_").replace("_", " ")

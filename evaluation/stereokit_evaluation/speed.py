@@ -1,0 +1,296 @@
+"""The command ``stereokit bench``: our methods and other libraries timed side by side, losses included.
+
+A time is that of one whole call, from two grey ``uint8`` images to the map that the caller gets, with default
+options. Everyone is called once to warm up; then all take turns, round by round, in one process, on the same images
+and with the same number of threads (OpenCV's own is set to it as well, also for the filters that our methods borrow
+from it). Memory and the first call are measured in processes of their own (`stereokit_evaluation._probes`).
+
+OpenCV's SGBM and HH modes hardly use a second thread; they are reported for every number of threads all the same.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from typing import Annotated
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from stereokit.defaults import METHODS
+from stereokit.errors import InputError, OptionError
+from stereokit.io import check_output, read_image, write_bytes
+from stereokit.matching import parse_method
+from stereokit_evaluation._peers import PEERS, Call, label, make, peers
+from stereokit_evaluation._probes import first_call, memory_added, stored
+from stereokit_evaluation._rounds import round_robin
+from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
+from stereokit_evaluation._stage_times import stage_times
+from stereokit_evaluation.scenes import generate
+
+__all__ = ["bench", "parse_sizes", "parse_threads"]
+
+_BAR_AFTER_S = 1.0
+_FIRST_CALLS = 3
+_MEMORY_SIZES = ("K", "M")
+_MOST_LEVELS = 2048
+
+Gray = NDArray[np.uint8]
+Step = Callable[[str], None]
+
+
+def bench(
+    with_peers: Annotated[
+        bool, typer.Option("--peers/--no-peers", help="Time other libraries that are installed too.")
+    ] = True,
+    sizes: Annotated[str, typer.Option(help="K, M, H or WxHxD such as 640x480x64, with commas.")] = "K,M,H",
+    threads: Annotated[str, typer.Option(help="Numbers of threads, with commas.")] = "1,2",
+    method: Annotated[
+        list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat; all four by default.")
+    ] = None,
+    rounds: Annotated[int, typer.Option(help="Times that everyone is called.")] = 9,
+    stages: Annotated[bool, typer.Option("--stages", help="Time the stages of our methods too.")] = False,
+    left: Annotated[Path | None, typer.Option(help="Left image, instead of a synthetic one.")] = None,
+    right: Annotated[Path | None, typer.Option(help="Right image.")] = None,
+    memory: Annotated[
+        bool | None,
+        typer.Option("--memory/--no-memory", help="Memory that a call adds; by default for K and M."),
+    ] = None,
+    first: Annotated[
+        bool, typer.Option("--first-call/--no-first-call", help="Time of the first call in a new process.")
+    ] = True,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to this file; - prints them.")
+    ] = None,
+) -> None:
+    """Time our methods against other libraries: median, quartiles, memory.
+
+    Sizes are K = 1242x375 with 128 levels, M = 1342x1110 with 256 and H = 621x188 with 64. The columns "x HH" and
+    "x 3WAY" say how many times faster than these modes of OpenCV a method is; below 1 it is slower. MDE/s are
+    millions of pixels times levels per second.
+    """
+    chosen, counts = parse_sizes(sizes), parse_threads(threads)
+    if rounds < 1:
+        raise OptionError(f"rounds must be at least 1, got {rounds}")
+    if json_file is not None and str(json_file) != "-":
+        check_output(json_file, name="json")
+    if (left is None) != (right is None):
+        raise OptionError("left and right go together, got only one of them")
+    pictures = None if left is None or right is None else (_read(left), _read(right))
+    if pictures is not None and pictures[0].shape != pictures[1].shape:
+        raise InputError(f"left and right must have the same size, got {pictures[0].shape} and {pictures[1].shape}")
+    methods = list(dict.fromkeys(parse_method(name) for name in method or METHODS))
+    contenders = [*methods, *(peers() if with_peers else ())]
+
+    weighed = [size for size in chosen if (size.name in _MEMORY_SIZES if memory is None else memory)]
+    steps = len(chosen) * len(counts) * len(contenders) * (1 + rounds) + len(weighed) * len(contenders)
+    steps += len(methods) * (stages * len(chosen) + first)
+    findings = Findings(methods=methods, sizes=chosen, threads=counts, rounds=rounds)
+    with _progress(steps) as (console, step):
+        try:
+            for size in chosen:
+                step(f"{size.name}: images", 0)
+                images = _images(size, pictures)
+                for count in counts:
+                    _time(size, count, contenders, images, findings, step)
+                if size in weighed:
+                    _weigh(size, max(counts), contenders, images, findings, step)
+                for name in methods if stages else ():
+                    with _opencv_threads(1):
+                        findings.stages[size.name, name] = stage_times(name, size.levels, *images, rounds)
+                    step(f"{size.name}: stages of {name}")
+            if first:
+                size = next((size for size in chosen if size.name == "K"), chosen[0])
+                _time_first(size, max(counts), methods, _images(size, pictures), findings, step)
+        except KeyboardInterrupt:
+            findings.interrupted = True
+            console.print("interrupted: the figures are those measured so far", highlight=False)
+    options = {
+        "sizes": [size.name for size in chosen], "threads": counts, "methods": methods, "rounds": rounds,
+        "peers": with_peers, "memory": [size.name for size in weighed], "stages": stages,
+        "images": "synthetic" if left is None else [str(left), str(right)],
+    }  # fmt: skip
+    text = json.dumps(as_json(findings, options), indent=2, allow_nan=False) + "\n"
+    if str(json_file) == "-":
+        typer.echo(text, nl=False)
+    else:
+        if json_file is not None:
+            write_bytes(json_file, text.encode())
+        print_tables(findings)
+    if findings.interrupted:
+        raise typer.Exit(130)
+
+
+def parse_sizes(text: str) -> list[Size]:
+    """Return the sizes named in `text`, such as ``"K,640x480x64"``, each once.
+
+    Raises
+    ------
+    OptionError
+        If one is neither known nor ``WxHxD``, or has no more columns than levels.
+    """
+    found: list[Size] = []
+    for word in (part.strip() for part in text.split(",")):
+        numbers = re.fullmatch(r"(\d{1,6})x(\d{1,6})x(\d{1,6})", word.lower())
+        if word.upper() in SIZES:
+            size = SIZES[word.upper()]
+        elif numbers:
+            width, height, levels = (int(number) for number in numbers.groups())
+            size = Size(f"{width}x{height}x{levels}", width, height, levels)
+            if height < 1 or not 2 <= levels <= _MOST_LEVELS or width <= levels:
+                raise OptionError(
+                    f"sizes must be WxHxD with H of 1 or more, D from 2 to {_MOST_LEVELS} and W above D, got {word!r}"
+                )
+        else:
+            raise OptionError(f"sizes must be K, M, H or WxHxD such as 640x480x64, with commas, got {word!r}")
+        found.append(size)
+    return list(dict.fromkeys(found))
+
+
+def parse_threads(text: str) -> list[int]:
+    """Return the numbers in `text`, such as ``"1,2"``, each once.
+
+    Raises
+    ------
+    OptionError
+        If one is no whole number from 1 to 1024.
+    """
+    words = [word.strip() for word in text.split(",")]
+    if not all(re.fullmatch(r"[0-9]{1,4}", word) and 1 <= int(word) <= 1024 for word in words):
+        raise OptionError(f"threads must be whole numbers from 1 to 1024, with commas, got {text!r}")
+    return list(dict.fromkeys(int(word) for word in words))
+
+
+def _read(path: Path) -> Gray:
+    image = read_image(path, gray=True)
+    return (image // 257).astype(np.uint8) if image.dtype == np.uint16 else image
+
+
+def _images(size: Size, pictures: tuple[Gray, Gray] | None) -> tuple[Gray, Gray]:
+    """Return the pair of this size, grey: a synthetic street, or the given pictures resized."""
+    if pictures is None:
+        scene = generate(0, size.width, size.height, size.levels)
+        made = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
+    else:
+        wanted = (size.width, size.height)
+        made = [cv2.resize(image, wanted, interpolation=cv2.INTER_AREA) for image in pictures]
+    left, right = (np.ascontiguousarray(image, np.uint8).reshape(size.height, size.width) for image in made)
+    return left, right
+
+
+def _time(
+    size: Size, threads: int, contenders: Sequence[str], images: tuple[Gray, Gray], findings: Findings, step: Step
+) -> None:
+    """Warm everyone up, then time them in turns; the seconds go to ``findings.times``."""
+    calls: dict[str, Call] = {}
+    with _opencv_threads(threads):
+        for key in contenders:
+            step(f"{size.name}, {threads} threads: {label(key)}, first call")
+            reason = _too_large(key, size)
+            if reason is None:
+                call = make(key, size.levels, threads)
+                try:
+                    call(*images)
+                    calls[key] = call
+                except Exception as error:
+                    if key not in PEERS and not isinstance(error, MemoryError):
+                        raise
+                    reason = " ".join(str(error).split()) or type(error).__name__
+            if reason is not None:
+                findings.skip(size, label(key), threads, reason)
+        round_robin(
+            {key: lambda call=call: call(*images) for key, call in calls.items()},  # type: ignore[misc]
+            findings.rounds,
+            findings.times.setdefault((size.name, threads), {}),
+            step=lambda key: step(f"{size.name}, {threads} threads: {label(key)}"),
+        )
+
+
+def _weigh(
+    size: Size, threads: int, contenders: Sequence[str], images: tuple[Gray, Gray], findings: Findings, step: Step
+) -> None:
+    with stored(*images) as files:
+        for key in contenders:
+            if _too_large(key, size) is None:
+                findings.memory[size.name, key] = memory_added(key, size.levels, threads, files)
+            step(f"{size.name}: memory of {label(key)}")
+
+
+def _time_first(
+    size: Size, threads: int, methods: Sequence[str], images: tuple[Gray, Gray], findings: Findings, step: Step
+) -> None:
+    """Time first calls in new processes; one process more, before them, sees to it that the disk cache is warm."""
+    findings.first_size = size.name
+    with stored(*images) as files:
+        for key in methods:
+            runs = [first_call(key, size.levels, threads, files) for _ in range(1 + min(_FIRST_CALLS, findings.rounds))]
+            done = [run for run in runs[1:] if run is not None]
+            if done:
+                findings.first[key] = {name: median(run[name] for run in done) for name in done[0]}
+            else:
+                findings.skip(size, label(key), threads, "the first call failed in a new process")
+            step(f"{size.name}: first call of {label(key)}")
+
+
+def _too_large(key: str, size: Size) -> str | None:
+    """Return why this peer is left out: the machine's free memory does not hold what it is known to need."""
+    needed = PEERS[key].bytes_per_cell * size.cells if key in PEERS else 0
+    free = _free_bytes()
+    if free is None or needed <= 0.8 * free:
+        return None
+    return f"needs {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free"
+
+
+def _free_bytes() -> float | None:
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024.0 * int(line.split()[1])
+    except OSError:
+        pass
+    return None
+
+
+@contextmanager
+def _opencv_threads(threads: int) -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[tuple[Console, Callable[..., None]]]:
+    """Show a bar on standard error after the first second; it is drawn between calls only, never during one."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not console.is_terminal)
+    task = bar.add_task("", total=total)
+    begun, shown = time.monotonic(), -math.inf
+
+    def step(text: str, advance: int = 1) -> None:
+        nonlocal shown
+        bar.update(task, advance=advance, description=text)
+        now = time.monotonic()
+        if now - begun > _BAR_AFTER_S and now - shown > 0.2:
+            shown = now
+            if not bar.live.is_started:
+                bar.start()
+            bar.refresh()
+
+    try:
+        yield console, step
+    finally:
+        bar.stop()

@@ -93,7 +93,7 @@ class Dt:
         Which of the two published forms.
     """
 
-    sigma_s: float = 10.0
+    sigma_s: float = 20.0
     sigma_v: float | None = 6.0
     sigma_r: float = 30.0
     passes: int = 1

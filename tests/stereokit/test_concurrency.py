@@ -91,6 +91,43 @@ def test_an_error_leaves_the_matcher_usable():
     np.testing.assert_array_equal(matcher(*pair).disparity, expected)
 
 
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_map_gives_the_results_of_single_calls_in_order(threads):
+    pairs = [pair_of(seed, (20 + seed % 3, 40)) for seed in range(11)]
+    matcher = Matcher("census+sgm", max_disparity=16, threads=threads, confidence=True)
+    counts = []
+    results = list(matcher.map(iter(pairs), progress=counts.append))
+    assert counts == list(range(1, 12))
+    for result, pair in zip(results, pairs, strict=True):
+        assert_same(result, matcher(*pair))
+    assert list(matcher.map([])) == []
+
+
+def test_map_takes_pairs_as_results_are_taken():
+    taken = []
+
+    def endless():
+        while True:
+            taken.append(1)
+            yield pair_of(4, (12, 30))
+
+    matcher = Matcher("census+sgm", max_disparity=16, threads=2)
+    results = matcher.map(endless())
+    for done in range(1, 6):
+        next(results)
+        assert len(taken) <= done + 2 * matcher.threads
+    results.close()
+    assert matcher(*pair_of(4)).disparity.shape == (37, 53)
+
+
+def test_map_raises_when_the_turn_of_a_bad_pair_comes():
+    good = pair_of(5, (12, 30))
+    results = Matcher("census+sgm", max_disparity=16, threads=2).map([good, (good[0], good[1][:5]), good])
+    assert next(results).disparity.shape == (12, 30)
+    with pytest.raises(stereokit.InputError, match="same size"):
+        next(results)
+
+
 def test_a_forked_child_can_match(run_python, tmp_path):
     script = tmp_path / "fork.py"
     script.write_text(

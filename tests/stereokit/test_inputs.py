@@ -221,6 +221,11 @@ def test_matching_smoothed_images_is_smoothing_before_matching(method):
     inside = Matcher(method, smooth=0.8, **options)(left, right)
     before = Matcher(method, smooth=0, **options)(pair.left, pair.right)
     np.testing.assert_array_equal(inside.disparity, before.disparity)
+    cost = method.split("+")[0]
+    np.testing.assert_array_equal(
+        stereokit.cost_volume(left, right, cost, max_disparity=16, smooth=0.8),
+        stereokit.cost_volume(pair.left, pair.right, cost, max_disparity=16),
+    )
 
 
 A = np.zeros((4, 5), np.uint8)

@@ -7,6 +7,7 @@
 from stereokit.calibration import Calibration
 from stereokit.costs import Census, RowCost, Zncc
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
+from stereokit.io import read_disparity, read_image, write_disparity
 from stereokit.matching import METHODS, Matcher, match, warmup
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
@@ -33,8 +34,11 @@ __all__ = [
     "aggregate",
     "cost_volume",
     "match",
+    "read_disparity",
+    "read_image",
     "select",
     "warmup",
+    "write_disparity",
 ]
 
 __version__ = "0.1.0"

@@ -1,15 +1,20 @@
 """Those who are timed by ``stereokit bench``: our methods, and the libraries that people use instead.
 
 A peer is a name, the module that it needs and a factory; it takes part only when that module can be imported. All
-take two grey ``uint8`` images and are called as their users call them: OpenCV's matchers get the whole image without
-padding (which costs them the leftmost columns, not time), their usual penalties for block size 5, a uniqueness
-ratio, the left-right check and no speckle filter. Only peers that were run here are listed.
+take two grey ``uint8`` images and are called as their users call them. Only peers that were run are listed.
+
+OpenCV's matchers get the whole image without padding (which costs them the leftmost columns, not time), their usual
+penalties for block size 5, a uniqueness ratio, the left-right check and no speckle filter. Pandora (CNES) runs its
+census and libSGM with its default penalties, sub-pixel refinement, median and left-right check; it chooses its own
+threads, and takes so long that it is called at most three times.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -44,12 +49,15 @@ class Peer:
         Takes the number of disparity levels and returns the call that is timed.
     bytes_per_cell : int
         Known memory per pixel and level, to leave it out where the machine cannot hold it; 0 if little or unknown.
+    most_rounds : int or None
+        It is not called more often than this.
     """
 
     name: str
     module: str
     make: Callable[[int], Call]
     bytes_per_cell: int = 0
+    most_rounds: int | None = None
 
 
 def _opencv(mode: int) -> Callable[[int], Call]:
@@ -72,6 +80,37 @@ def _opencv(mode: int) -> Callable[[int], Call]:
     return build
 
 
+def _pandora(levels: int) -> Call:
+    pandora, xarray = import_module("pandora"), import_module("xarray")
+    add_disparity = import_module("pandora.img_tools").add_disparity
+    logging.getLogger("transitions").setLevel(logging.ERROR)  # it warns of its own machine
+    pandora.import_plugin()
+    steps = {
+        "matching_cost": {"matching_cost_method": "census", "window_size": 5},
+        "optimization": {"optimization_method": "sgm"},
+        "disparity": {"disparity_method": "wta", "invalid_disparity": "NaN"},
+        "refinement": {"refinement_method": "vfit"},
+        "filter": {"filter_method": "median", "filter_size": 3},
+        "validation": {"validation_method": "cross_checking_accurate"},
+    }
+
+    def dataset(image: NDArray[np.uint8], disparities: list[int]) -> Any:
+        coordinates = {"row": np.arange(image.shape[0]), "col": np.arange(image.shape[1])}
+        attributes = {"no_data_img": 0, "valid_pixels": 0, "no_data_mask": 1, "crs": None, "transform": None}
+        found = xarray.Dataset({"im": (["row", "col"], image.astype(np.float32))}, coordinates, attributes)
+        return add_disparity(found, disparities, None)
+
+    def call(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[Any]:
+        pair = dataset(left, [1 - levels, 0]), dataset(right, [0, levels - 1])  # its disparities are negative
+        machine = import_module("pandora.state_machine").PandoraMachine()
+        check = import_module("pandora.check_configuration").check_pipeline_section
+        settings = check({"pipeline": steps}, *(one.assign_coords(band_im=[None]) for one in pair), machine)
+        found, _ = pandora.run(machine, *pair, settings)
+        return -np.asarray(found["disparity_map"].values)
+
+    return call
+
+
 # The full modes keep two volumes of int16, costs and sums, for the whole image.
 PEERS: dict[str, Peer] = {
     peer.name: peer
@@ -80,9 +119,10 @@ PEERS: dict[str, Peer] = {
         Peer(THREE_WAY, "cv2", _opencv(cv2.STEREO_SGBM_MODE_SGBM_3WAY)),
         Peer(HH, "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH), 4),
         Peer("OpenCV HH4", "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH4), 4),
+        Peer("pandora libSGM", "pandora_plugin_libsgm", _pandora, 26, 3),
     )
 }
-"""Peers by name: OpenCV's semi-global matcher in 5, 3, 8 and 4 directions."""
+"""Peers by name: OpenCV's semi-global matcher in 5, 3, 8 and 4 directions, and pandora's."""
 
 
 def peers() -> list[str]:

@@ -61,6 +61,7 @@ def round_robin(
     rounds: int,
     times: dict[str, list[float]],
     *,
+    most: Mapping[str, int] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     step: Callable[[str], None] | None = None,
 ) -> None:
@@ -74,13 +75,17 @@ def round_robin(
         Number of rounds.
     times : dict of str to list of float
         Seconds are appended here, run by run, so that an interrupt leaves all that was measured.
+    most : mapping of str to int or None
+        Names that take part in the first so many rounds only.
     clock : callable
         Returns seconds.
     step : callable or None
         Called with the name after each run, outside the timed part.
     """
-    for _ in range(rounds):
+    for number in range(rounds):
         for name, call in calls.items():
+            if most is not None and number >= most.get(name, rounds):
+                continue
             begun = clock()
             result = call()
             ended = clock()

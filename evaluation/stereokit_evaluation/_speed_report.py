@@ -196,8 +196,9 @@ def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> 
             amount = findings.memory.get((size.name, key)) if most else None
             share = _share(findings, size.name, key) if most else None
             memory = (_figure(amount, 0 if amount and amount >= 10 else 1), _figure(share, 2))
+        runs = "" if row["runs"] == findings.rounds else f" ({row['runs']} runs)"
         table.add_row(
-            row["contender"],
+            row["contender"] + runs,
             str(row["threads"]),
             _milliseconds(row["median_ms"]),
             f"{_milliseconds(row['q25_ms'])}-{_milliseconds(row['q75_ms'])}",
@@ -215,9 +216,12 @@ def _stages_table(size: Size, stages: dict[str, dict[str, float]]) -> Table:
     table = _table(f"{size.name}: stages, 1 thread, ms", "stage")
     for key in stages:
         table.add_column(label(key), justify="right")
-    names = dict.fromkeys(name for ms in stages.values() for name in list(ms)[:-2])
-    last = list(next(iter(stages.values())))[-2:]
-    for name in (*names, *last):
+    names: list[str] = []  # of all methods, each stage after the one that it follows in its method
+    for ms in stages.values():
+        for before, name in zip([None, *ms], ms, strict=False):
+            if name not in names:
+                names.insert(names.index(before) + 1 if before is not None else 0, name)
+    for name in names:
         table.add_row(name, *("" if name not in ms else f"{ms[name]:.2f}" for ms in stages.values()))
     return table
 

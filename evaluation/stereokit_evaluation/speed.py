@@ -212,6 +212,7 @@ def _time(
             {key: lambda call=call: call(*images) for key, call in calls.items()},  # type: ignore[misc]
             findings.rounds,
             findings.times.setdefault((size.name, threads), {}),
+            most={key: most for key in calls if key in PEERS and (most := PEERS[key].most_rounds) is not None},
             step=lambda key: step(f"{size.name}, {threads} threads: {label(key)}"),
         )
 

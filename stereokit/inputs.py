@@ -28,6 +28,9 @@ __all__ = [
     "smooth",
 ]
 
+MAX_DISPARITY = 2**20
+"""Bound of `min_disparity`, far beyond any image."""
+
 _TYPES = (np.uint8, np.uint16, np.float32, np.float64)
 
 
@@ -84,8 +87,18 @@ def check_names(kind: str, given: Any, known: Any) -> None:
             raise OptionError(did_you_mean(kind, str(name), known))
 
 
-def _gray(name: str, image: Any) -> NDArray[Any]:
-    array = np.asarray(image)
+def writable(array: Any) -> NDArray[Any]:
+    """Return `array`, or a copy, C-contiguous and writable: what kernels were compiled for. It is not written to."""
+    contiguous = np.ascontiguousarray(array)
+    return contiguous if contiguous.flags.writeable else contiguous.copy()
+
+
+def _checked(name: str, image: Any) -> NDArray[Any]:
+    """Return an image of an accepted type and shape, (H, W) or (H, W, 3)."""
+    try:
+        array = np.asarray(image)
+    except ValueError as error:
+        raise InputError(f"{name} must be an array of numbers: {error}") from None
     if array.dtype not in _TYPES:
         raise InputError(f"{name} must be uint8, uint16, float32 or float64, got {array.dtype}")
     if array.ndim == 3 and array.shape[2] == 1:
@@ -94,11 +107,29 @@ def _gray(name: str, image: Any) -> NDArray[Any]:
         raise InputError(f"{name} must be grey (H, W) or RGB (H, W, 3), got shape {array.shape}")
     if 0 in array.shape:
         raise InputError(f"{name} must not be empty, got shape {array.shape}")
-    if array.dtype == np.float64 and array.ndim == 3:
-        return np.asarray(array @ np.array([0.299, 0.587, 0.114]))
-    if array.ndim == 3:
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(array), cv2.COLOR_RGB2GRAY))
     return array
+
+
+def _gray(array: NDArray[Any]) -> NDArray[Any]:
+    if array.ndim == 2:
+        return array
+    if array.dtype == np.float64:
+        with np.errstate(invalid="ignore"):  # inf - inf, inf * 0: such pixels are bad ones
+            return np.asarray(array @ np.array([0.299, 0.587, 0.114]))
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(array), cv2.COLOR_RGB2GRAY))
+
+
+def _whole_numbers(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return float images that both hold whole numbers of 8 or 16 bits as such, others as they are."""
+    with np.errstate(invalid="ignore"):
+        for limit, kind in ((255, np.uint8), (65535, np.uint16)):
+            as_is = left.astype(kind), right.astype(kind)
+            if all(
+                np.array_equal(whole, image) and image.max() <= limit
+                for whole, image in zip(as_is, (left, right), strict=True)
+            ):
+                return as_is
+    return left, right
 
 
 def _fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
@@ -116,14 +147,9 @@ def _fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
 
 
 def _integers(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Bring finite floats to whole numbers of 8 or 16 bits, both images alike."""
+    """Bring finite floats to 16 bits over their common range."""
     low = min(float(left.min()), float(right.min()))
     high = max(float(left.max()), float(right.max()))
-    for limit, kind in ((255, np.uint8), (65535, np.uint16)):
-        if low >= 0 and high <= limit:
-            as_is = left.astype(kind), right.astype(kind)
-            if np.array_equal(as_is[0], left) and np.array_equal(as_is[1], right):
-                return as_is
     if high <= low:
         return np.zeros(left.shape, np.uint8), np.zeros(right.shape, np.uint8)
 
@@ -147,11 +173,14 @@ def gray_pair(left: Any, right: Any) -> GrayPair:
     InputError
         If an image has another shape or type, is empty, or the two differ.
     """
-    a, b = _gray("left", left), _gray("right", right)
-    if a.shape != b.shape:
-        raise InputError(f"left and right must have the same size, got {a.shape} and {b.shape}")
+    a, b = _checked("left", left), _checked("right", right)
     if a.dtype != b.dtype:
         raise InputError(f"left and right must have the same type, got {a.dtype} and {b.dtype}")
+    if a.shape[:2] != b.shape[:2]:
+        raise InputError(f"left and right must have the same size, got {a.shape[:2]} and {b.shape[:2]}")
+    if a.dtype.kind == "f":
+        a, b = _whole_numbers(a, b)
+    a, b = _gray(a), _gray(b)
     bad: list[NDArray[np.bool_] | None] = [None, None]
     if a.dtype.kind == "f":
         images = [a, b]
@@ -160,10 +189,12 @@ def gray_pair(left: Any, right: Any) -> GrayPair:
             if not finite.all():
                 bad[k] = ~finite
                 images[k] = _fill_bad(image, ~finite)
-        a, b = _integers(*images)
-    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+        a, b = _whole_numbers(*images)
+        if a.dtype.kind == "f":
+            a, b = _integers(a, b)
     if a.dtype == np.uint16 and max(int(a.max()), int(b.max())) <= 255:
         a, b = a.astype(np.uint8), b.astype(np.uint8)
+    a, b = writable(a), writable(b)
     return GrayPair(a, b, bad[0], bad[1], _guide(a, b))
 
 

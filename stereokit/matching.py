@@ -25,6 +25,7 @@ from stereokit.costs.rows import Levels, Pair
 from stereokit.defaults import DEFAULTS, METHODS
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import (
+    MAX_DISPARITY,
     GrayPair,
     check_flag,
     check_integer,
@@ -82,8 +83,22 @@ def parse_method(method: str) -> str:
     return "+".join(parts)
 
 
-def build_cost(name: str, options: dict[str, Any]) -> Any:
-    """Return the cost called `name` with `options`; raise OptionError for those that it does not have."""
+def check_levels(min_disparity: Any, max_disparity: Any) -> Levels:
+    """Return the levels ``min_disparity <= d < max_disparity``; raise OptionError if there are none or too many."""
+    low = check_integer("min_disparity", min_disparity, -MAX_DISPARITY, MAX_DISPARITY)
+    high = check_integer("max_disparity", max_disparity, low + 1)
+    if high - low > _MAX_LEVELS:
+        raise OptionError(f"max_disparity - min_disparity must be at most {_MAX_LEVELS}, got {high - low}")
+    return Levels(low, high - low)
+
+
+def build_cost(name: Any, options: dict[str, Any]) -> Any:
+    """Return the cost called `name` with `options`; raise OptionError for those that it does not have.
+
+    A cost that is given itself is returned as it is.
+    """
+    if hasattr(name, "prepare") and not isinstance(name, type) and not options:
+        return name
     return _build("cost", COSTS.get(name), options)
 
 
@@ -151,17 +166,13 @@ class Matcher:
         refiner: str | None = None, device: str = "auto", threads: int | None = None, **options: Any,
     ) -> None:  # fmt: skip
         self.method = parse_method(method)
-        self.min_disparity = check_integer("min_disparity", min_disparity)
-        self.max_disparity = check_integer("max_disparity", max_disparity, self.min_disparity + 1)
-        if self.max_disparity - self.min_disparity > _MAX_LEVELS:
-            raise OptionError(
-                f"max_disparity - min_disparity must be at most {_MAX_LEVELS}, "
-                f"got {self.max_disparity - self.min_disparity}"
-            )
-        if scale not in (1, 0.5):
+        levels = check_levels(min_disparity, max_disparity)
+        self.min_disparity = levels.minimum
+        self.max_disparity = levels.minimum + levels.count
+        if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or scale not in (1, 0.5):
             raise OptionError(f"scale must be 1 or 0.5, got {scale!r}")
         self.scale = float(scale)
-        if device not in ("auto", "cpu", "cuda"):
+        if not isinstance(device, str) or device not in ("auto", "cpu", "cuda"):
             raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {device!r}")
         if device == "cuda":
             raise OptionError("device 'cuda' is not available in this version; use 'cpu' or 'auto'")
@@ -169,8 +180,9 @@ class Matcher:
         self.threads = available_threads() if threads is None else check_integer("threads", threads, 1)
         if refiner is not None and self.scale == 1:
             raise OptionError(f"refiner needs scale=0.5, got refiner={refiner!r} with scale=1")
-        self.refiner = None if self.scale == 1 else (refiner or "linear").lower()
-        self._refine = None if self.refiner is None else REFINERS.get(self.refiner)()
+        name = "linear" if refiner is None else refiner
+        self._refine = None if self.scale == 1 else REFINERS.get(name)()
+        self.refiner = None if self.scale == 1 else name.lower()
         self._set_stages(options)
         self._pool = Pool()
 
@@ -181,15 +193,17 @@ class Matcher:
         check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options}))
         merged = {**DEFAULTS[""], **DEFAULTS.get(self.method, {}), **options}
         self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
+        if "p2" not in options and "p2" in merged:  # a default gives way to what the cost leaves of 8 bits
+            merged["p2"] = min(merged["p2"], (255 - self.cost.cost_max) / self.cost.unit)
         self.aggregation = aggregation(**{k: merged[k] for k in aggregation_options if k in merged})
         if hasattr(self.aggregation, "penalties"):
             self.aggregation.penalties(self.cost.cost_max, self.cost.unit)
         self.fill = None if merged["fill"] in (None, "none") else merged["fill"]
-        if self.fill is not None and self.fill not in FILLS:
+        if self.fill is not None and (not isinstance(self.fill, str) or self.fill not in FILLS):
             raise UnknownNameError(did_you_mean("fill", str(self.fill), (*FILLS, "none")))
-        if merged["median"] not in (0, 3, 5):
-            raise OptionError(f"median must be 0, 3 or 5, got {merged['median']!r}")
-        self.median = int(merged["median"])
+        self.median = check_integer("median", merged["median"])
+        if self.median not in (0, 3, 5):
+            raise OptionError(f"median must be 0, 3 or 5, got {self.median}")
         outside = merged["outside"]
         self.outside = None if outside is None else check_number("outside", outside, 0, 1)
         self.smooth = check_number("smooth", merged["smooth"], 0, 10)
@@ -216,7 +230,8 @@ class Matcher:
         -------
         Disparity
             Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, if asked for,
-            ``confidence`` and the ``right`` view's map.
+            ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
+            a filled map is `min_disparity` everywhere.
 
         Raises
         ------
@@ -307,7 +322,9 @@ class Matcher:
                 disparity, int(self.speckle * disparity.size), threads=threads, workspace=workspace
             )
         valid = ~np.isnan(disparity)
-        if self.fill is not None:
+        if self.fill is not None and not valid.any():
+            disparity[:] = low  # nothing was measured anywhere: as far away as the range goes
+        elif self.fill is not None:
             disparity = fill(disparity, self.fill, threads=threads)
         if self.median:
             disparity = median(disparity, self.median)
@@ -355,7 +372,7 @@ def match(left: Any, right: Any, method: str = "zncc+sgm", **options: Any) -> ND
         If an image or an option cannot be used.
     """
     try:
-        key = (method, tuple(sorted(options.items())))
+        key = (method, tuple((name, type(options[name]), options[name]) for name in sorted(options)))
         hash(key)
     except TypeError:
         return Matcher(method, **options)(left, right).disparity

@@ -60,6 +60,8 @@ class Registry(Generic[T]):
         UnknownNameError
             If nothing has that name.
         """
+        if not isinstance(name, str):
+            raise OptionError(f"{self.kind} must be a name, got {name!r}")
         key = name.lower()
         if key not in self._items:
             for entry in self._entries():

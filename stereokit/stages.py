@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume
 from stereokit.errors import InputError, OptionError
-from stereokit.inputs import check_integer, check_number, gray_pair
+from stereokit.inputs import check_integer, check_number, gray_pair, writable
 from stereokit.inputs import smooth as smoothed
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.workspace import Workspace
-from stereokit.matching import build_aggregation, build_cost
+from stereokit.matching import build_aggregation, build_cost, check_levels
 from stereokit.selection.wta import winners_like
 
 __all__ = ["aggregate", "cost_volume"]
 
 
 def cost_volume(
-    left: Any, right: Any, cost: str = "zncc", *, max_disparity: int = 128, min_disparity: int = 0,
+    left: Any, right: Any, cost: str | Cost = "zncc", *, max_disparity: int = 128, min_disparity: int = 0,
     outside: float | None = 1.0, smooth: float = 0.0, threads: int | None = None, **options: Any,
 ) -> NDArray[np.uint8]:  # fmt: skip
     """Return the matching costs of all pixels and levels.
@@ -33,8 +33,8 @@ def cost_volume(
     ----------
     left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
         Rectified images.
-    cost : str
-        Name of the cost.
+    cost : str or Cost
+        Name of the cost, or the cost itself.
     max_disparity, min_disparity : int
         Levels ``min_disparity <= d < max_disparity``, pixels.
     outside : float or None
@@ -57,8 +57,7 @@ def cost_volume(
         If an image or an option cannot be used.
     """
     stage: Cost = build_cost(cost, options)
-    low = check_integer("min_disparity", min_disparity)
-    levels = Levels(low, check_integer("max_disparity", max_disparity, low + 1) - low)
+    levels = check_levels(min_disparity, max_disparity)
     count = available_threads() if threads is None else check_integer("threads", threads, 1)
     share = None if outside is None else check_number("outside", outside, 0, 1)
     gray = smoothed(gray_pair(left, right), check_number("smooth", smooth, 0, 10))
@@ -99,14 +98,14 @@ def aggregate(
         If the volume, the guide or an option cannot be used.
     """
     stage = build_aggregation(aggregation, options)
-    maker: Cost = build_cost(cost, {}) if isinstance(cost, str) else cost
+    maker: Cost = build_cost(cost, {})
     volume = np.asarray(volume)
     floats = volume.dtype == np.float32
     if volume.ndim != 3 or 0 in volume.shape or not (volume.dtype == np.uint8 or floats):
         raise InputError(f"volume must be (H, W, D) uint8 or float32, got {volume.dtype} {volume.shape}")
     if floats and stage.name != "dt":
         raise InputError("volume must be uint8 for aggregation 'sgm', got float32")
-    guide = np.ascontiguousarray(guide)
+    guide = writable(guide)
     if guide.dtype != np.uint8 or guide.shape != volume.shape[:2]:
         raise InputError(f"guide must be uint8 {volume.shape[:2]}, got {guide.dtype} {guide.shape}")
     count = available_threads() if threads is None else check_integer("threads", threads, 1)
@@ -118,7 +117,7 @@ def aggregate(
     total = np.empty((height, width, levels.padded), total_dtype)
     unused = np.empty((height, width), np.float32), np.empty((height, width), total_dtype)
     out = winners_like(*unused, None, depth, 0, False)
-    rows = [VolumeRows(np.ascontiguousarray(volume), levels.padded)] * max(2, count)
+    rows = [VolumeRows(writable(volume), levels.padded)] * max(2, count)
     extra: dict[str, Any] = {}
     if floats:
         padded = np.zeros((height, width, levels.padded), np.float32)

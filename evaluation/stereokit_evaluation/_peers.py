@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import UnknownNameError, did_you_mean
-from stereokit.matching import METHODS, Matcher, parse_method
+from stereokit.defaults import METHODS
+from stereokit.matching import Matcher
 
 __all__ = ["HH", "PEERS", "THREE_WAY", "Call", "Peer", "label", "make", "peers", "usable_levels"]
 
@@ -83,7 +83,9 @@ def _opencv(mode: int) -> Callable[[int], Call]:
 def _pandora(levels: int) -> Call:
     pandora, xarray = import_module("pandora"), import_module("xarray")
     add_disparity = import_module("pandora.img_tools").add_disparity
-    logging.getLogger("transitions").setLevel(logging.ERROR)  # it warns of its own machine
+    new_machine = import_module("pandora.state_machine").PandoraMachine
+    check = import_module("pandora.check_configuration").check_pipeline_section
+    logging.getLogger("transitions.core").setLevel(logging.ERROR)  # it warns of every step, right or wrong
     pandora.import_plugin()
     steps = {
         "matching_cost": {"matching_cost_method": "census", "window_size": 5},
@@ -102,8 +104,7 @@ def _pandora(levels: int) -> Call:
 
     def call(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[Any]:
         pair = dataset(left, [1 - levels, 0]), dataset(right, [0, levels - 1])  # its disparities are negative
-        machine = import_module("pandora.state_machine").PandoraMachine()
-        check = import_module("pandora.check_configuration").check_pipeline_section
+        machine = new_machine()
         settings = check({"pipeline": steps}, *(one.assign_coords(band_im=[None]) for one in pair), machine)
         found, _ = pandora.run(machine, *pair, settings)
         return -np.asarray(found["disparity_map"].values)
@@ -161,10 +162,5 @@ def make(key: str, levels: int, threads: int) -> Call:
     """
     if key in PEERS:
         return PEERS[key].make(levels)
-    try:
-        matcher = Matcher(parse_method(key), max_disparity=levels, threads=threads)
-    except UnknownNameError as error:
-        if "+" in key or key.upper() in METHODS:
-            raise
-        raise UnknownNameError(did_you_mean("method", key, [*METHODS, *METHODS.values(), *PEERS])) from error
+    matcher = Matcher(key, max_disparity=levels, threads=threads)
     return lambda left, right: matcher(left, right).disparity

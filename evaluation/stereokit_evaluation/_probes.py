@@ -24,9 +24,13 @@ if TYPE_CHECKING:  # the child imports as little as it can before the clock star
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["first_call", "memory_added", "stored"]
+__all__ = ["ProbeError", "first_call", "memory_added", "stored"]
 
 _TIMEOUT_S = 900
+
+
+class ProbeError(Exception):
+    """The new process failed; the message is the last line that it said."""
 
 
 @contextmanager
@@ -45,18 +49,21 @@ def memory_added(key: str, levels: int, threads: int, images: dict[str, str]) ->
     """Return the memory in MB (10**6 bytes) that one call adds at its peak, in a process that is ready for it.
 
     Images are loaded, and the code is compiled on a tiny pair, before the count begins. None where the system does
-    not tell, or where the call fails.
+    not tell. Raises ProbeError.
     """
-    outcome = _ask("memory", key, levels, threads, images)
-    return None if outcome is None else outcome["bytes"] and outcome["bytes"] / 1e6
+    added: int | None = _ask("memory", key, levels, threads, images)["bytes"]
+    return None if added is None else added / 1e6
 
 
-def first_call(key: str, levels: int, threads: int, images: dict[str, str]) -> dict[str, float] | None:
-    """Return ``import_s`` and ``call_s``: seconds of ``import stereokit``, and from there to the first map."""
+def first_call(key: str, levels: int, threads: int, images: dict[str, str]) -> dict[str, float]:
+    """Return ``import_s`` and ``call_s``: seconds of ``import stereokit``, and from there to the first map.
+
+    Raises ProbeError.
+    """
     return _ask("first", key, levels, threads, images)
 
 
-def _ask(what: str, key: str, levels: int, threads: int, images: dict[str, str]) -> dict[str, Any] | None:
+def _ask(what: str, key: str, levels: int, threads: int, images: dict[str, str]) -> dict[str, Any]:
     import stereokit
 
     homes = [str(Path(file).resolve().parents[1]) for file in (stereokit.__file__, __file__)]
@@ -69,11 +76,14 @@ def _ask(what: str, key: str, levels: int, threads: int, images: dict[str, str])
             capture_output=True,
             text=True,
             timeout=_TIMEOUT_S,
-            check=True,
+            check=False,
         )
-        answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
-        return None
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ProbeError(f"{what} probe: {error}") from error
+    if done.returncode != 0:
+        said = done.stderr.strip().splitlines()
+        raise ProbeError(f"{what} probe: {said[-1] if said else f'exit status {done.returncode}'}")
+    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return answer
 
 

@@ -67,6 +67,8 @@ class Findings:
         Contenders that were left out, and why.
     interrupted : bool
         Whether the user ended it.
+    load : list of float or None
+        The system's load (1, 5 and 15 minutes) when it began: figures from a busy machine are worth little.
     """
 
     methods: list[str]
@@ -80,6 +82,7 @@ class Findings:
     stages: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
     skipped: list[dict[str, Any]] = field(default_factory=list)
     interrupted: bool = False
+    load: list[float] | None = field(default_factory=lambda: _load())
 
     def skip(self, size: Size, contender: str, threads: int, reason: str) -> None:
         """Note that a contender was left out."""
@@ -151,7 +154,7 @@ def as_json(findings: Findings, options: dict[str, Any]) -> dict[str, Any]:
             "processors": available_threads(),
             "vector_bits": vector_bits(),
             "system": f"{platform.system()} {platform.machine()}",
-            "load": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
+            "load": findings.load,
         },
     }
 
@@ -179,7 +182,9 @@ def print_tables(findings: Findings) -> None:
         line = f"left out: {skip['contender']}, {skip['size']}, {_threads(skip['threads'])}: {skip['reason']}"
         console.print(line, markup=False, highlight=False)
     versions = ", ".join(f"{name} {number}" for name, number in _versions().items() if number)
-    console.print(f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors", highlight=False)
+    load = "" if findings.load is None else f", load {findings.load[0]:.1f} at the start"
+    machine = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{load}"
+    console.print(machine, markup=False, highlight=False)
     console.print(versions, highlight=False)
 
 
@@ -266,6 +271,13 @@ def _version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:
+        return None
+
+
+def _load() -> list[float] | None:
+    try:
+        return list(os.getloadavg())
+    except (AttributeError, OSError):  # not on Windows
         return None
 
 

@@ -32,7 +32,7 @@ from stereokit.errors import InputError, OptionError
 from stereokit.io import check_output, read_image, write_bytes
 from stereokit.matching import parse_method
 from stereokit_evaluation._peers import PEERS, Call, label, make, peers
-from stereokit_evaluation._probes import first_call, memory_added, stored
+from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._rounds import round_robin
 from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
 from stereokit_evaluation._stage_times import stage_times
@@ -223,7 +223,10 @@ def _weigh(
     with stored(*images) as files:
         for key in contenders:
             if _too_large(key, size) is None:
-                findings.memory[size.name, key] = memory_added(key, size.levels, threads, files)
+                try:
+                    findings.memory[size.name, key] = memory_added(key, size.levels, threads, files)
+                except ProbeError as error:
+                    findings.skip(size, label(key), threads, str(error))
             step(f"{size.name}: memory of {label(key)}")
 
 
@@ -234,12 +237,13 @@ def _time_first(
     findings.first_size = size.name
     with stored(*images) as files:
         for key in methods:
-            runs = [first_call(key, size.levels, threads, files) for _ in range(1 + min(_FIRST_CALLS, findings.rounds))]
-            done = [run for run in runs[1:] if run is not None]
-            if done:
-                findings.first[key] = {name: median(run[name] for run in done) for name in done[0]}
+            try:
+                first_call(key, size.levels, threads, files)
+                runs = [first_call(key, size.levels, threads, files) for _ in range(min(_FIRST_CALLS, findings.rounds))]
+            except ProbeError as error:
+                findings.skip(size, label(key), threads, str(error))
             else:
-                findings.skip(size, label(key), threads, "the first call failed in a new process")
+                findings.first[key] = {name: median(run[name] for run in runs) for name in runs[0]}
             step(f"{size.name}: first call of {label(key)}")
 
 

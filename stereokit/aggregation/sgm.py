@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stereokit.aggregation._paths import PathBuffers, first_visit, last_visit_row, start
 from stereokit.costs.rows import Cost, Levels
 from stereokit.errors import OptionError
-from stereokit.inputs import check_number
+from stereokit.inputs import check_integer, check_number
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.pool import run
 from stereokit.kernels.simd import LANES, load, store
@@ -63,8 +63,9 @@ class Sgm:
     total_dtype: ClassVar[Any] = np.uint16
 
     def __post_init__(self) -> None:
-        if self.paths not in (4, 5, 8):
+        if check_integer("paths", self.paths) not in (4, 5, 8):
             raise OptionError(f"paths must be 4, 5 or 8, got {self.paths!r}")
+        object.__setattr__(self, "paths", int(self.paths))
         check_number("edge", self.edge, 0, 1e6)
         check_number("edge_factor", self.edge_factor, 0, 1)
 

@@ -55,7 +55,7 @@ class Census:
     name: ClassVar[str] = "census"
 
     def __post_init__(self) -> None:
-        if self.window not in _WINDOWS:
+        if not isinstance(self.window, str) or self.window not in _WINDOWS:
             raise OptionError(f"window of census must be one of {', '.join(_WINDOWS)}, got {self.window!r}")
 
     @property

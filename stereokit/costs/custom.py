@@ -14,6 +14,7 @@ import numpy as np
 
 from stereokit.costs.rows import Pair, VolumeRows
 from stereokit.errors import OptionError
+from stereokit.inputs import check_integer
 from stereokit.kernels.pool import run, spans
 from stereokit.kernels.workspace import Workspace
 
@@ -42,8 +43,7 @@ class RowCost:
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise OptionError(f"function of a row cost must be callable, got {self.function!r}")
-        if not isinstance(self.cost_max, int) or not 1 <= self.cost_max <= 254:
-            raise OptionError(f"cost_max must be an integer from 1 to 254, got {self.cost_max!r}")
+        object.__setattr__(self, "cost_max", check_integer("cost_max", self.cost_max, 1, 254))
 
     def __call__(self) -> RowCost:
         """Return itself: a row cost has no options, so it is its own factory in the registry."""
@@ -62,12 +62,22 @@ class RowCost:
         worst = np.uint8(self.cost_max if pair.outside is None else round(pair.outside * self.cost_max))
         columns = np.arange(width)[:, None] - np.arange(levels.count)[None, :] - levels.minimum
         outside = (columns < 0) | (columns >= width)
+        margin = 0
+        left, right = pair.left, pair.right
+        if pair.outside is None:  # the function sees images that go on with their border pixels
+            margin = max(0, levels.minimum + levels.count - 1, -levels.minimum)
+            left, right = (np.pad(image, ((0, 0), (margin, margin)), mode="edge") for image in (left, right))
 
         def fill(y0: int, y1: int) -> None:
+            wide = np.empty((left.shape[1], levels.count), np.uint8)
             for y in range(y0, y1):
                 row = volume[y]
-                self.function(pair.left, pair.right, y, levels.minimum, row)
-                np.copyto(row, worst, where=outside)
+                if pair.outside is None:
+                    self.function(left, right, y, levels.minimum, wide)
+                    row[:] = wide[margin : margin + width]
+                else:
+                    self.function(left, right, y, levels.minimum, row)
+                    np.copyto(row, worst, where=outside)
                 if pair.right_bad is not None:
                     np.copyto(row, worst, where=pair.right_bad[y, np.clip(columns, 0, width - 1)])
                 if pair.left_bad is not None:

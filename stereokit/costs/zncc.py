@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements, pad_pair
 from stereokit.errors import OptionError
+from stereokit.inputs import check_integer
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
 from stereokit.kernels.simd import LANES, add, convert, load, maximum, multiply, splat, store, subtract
@@ -70,12 +71,11 @@ class Zncc:
     name: ClassVar[str] = "zncc"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.window, int) or self.window < 3 or self.window % 2 == 0:
-            raise OptionError(f"window of zncc must be an odd integer of at least 3, got {self.window!r}")
-        if self.window > 255:
-            raise OptionError(f"window of zncc must be at most 255, got {self.window}")
-        if not isinstance(self.steps, int) or not 1 <= self.steps <= 254:
-            raise OptionError(f"steps of zncc must be an integer from 1 to 254, got {self.steps!r}")
+        window = check_integer("window", self.window, 3, 255)
+        if window % 2 == 0:
+            raise OptionError(f"window must be odd, got {window}")
+        object.__setattr__(self, "window", window)
+        object.__setattr__(self, "steps", check_integer("steps", self.steps, 1, 254))
 
     @property
     def cost_max(self) -> int:
@@ -146,7 +146,7 @@ class Zncc:
         low, high = int(image.min()), int(image.max())
         factor = min(1.0, self.range_max / max(high - low, 1))
         centred = image.astype(np.float32)
-        centred -= np.float32((low + high) / 2)
+        centred -= np.float32((low + high) // 2)  # whole, or every pixel would be rounded from a half
         centred *= np.float32(factor)
         return np.asarray(np.rint(centred, out=centred), np.int16)
 

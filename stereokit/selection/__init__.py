@@ -1,5 +1,5 @@
 """Selection: from the aggregated costs of a pixel to its disparity."""
 
-from stereokit.selection.wta import Wta, select
+from stereokit.selection.wta import select
 
-__all__ = ["Wta", "select"]
+__all__ = ["select"]

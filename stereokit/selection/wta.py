@@ -7,17 +7,17 @@ gives the fraction of a pixel. Confidence is the margin to the best competitor t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, OptionError
+from stereokit.errors import InputError
+from stereokit.inputs import MAX_DISPARITY, check_flag, check_integer
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.simd import LANES, choose, first_bit, load, lowest, mask_equal, minimum, splat
 
-__all__ = ["Winners", "Wta", "select", "select_row", "winners_like"]
+__all__ = ["Winners", "select", "select_row", "winners_like"]
 
 
 class Winners(NamedTuple):
@@ -30,23 +30,6 @@ class Winners(NamedTuple):
     minimum: int
     subpixel: bool
     uniqueness: np.float32  # margin to the best rival below which a pixel is invalid, 0 to 1
-
-
-@dataclass(frozen=True)
-class Wta:
-    """Options of selection.
-
-    Parameters
-    ----------
-    subpixel : bool
-        Whether to interpolate between levels by a parabola.
-    """
-
-    subpixel: bool = True
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.subpixel, bool):
-            raise OptionError(f"subpixel must be True or False, got {self.subpixel!r}")
 
 
 @inline
@@ -101,7 +84,7 @@ def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int
     held_0 = keys[at + first]
     held_1 = keys[at + level]
     held_2 = keys[at + behind_last - 1]
-    most = keys.dtype.type(2 ** (8 * keys.itemsize - 1) - 1)
+    most = np.iinfo(keys.dtype).max
     keys[at + first] = most
     keys[at + level] = most
     keys[at + behind_last - 1] = most
@@ -164,9 +147,12 @@ def select(
 
     Raises
     ------
-    InputError
-        If the volume has another shape or type.
+    InputError, OptionError
+        If the volume has another shape or type, or an option breaks its rule.
     """
+    volume = np.asarray(volume)
+    low = check_integer("min_disparity", min_disparity, -MAX_DISPARITY, MAX_DISPARITY)
+    check_flag("subpixel", subpixel)
     if volume.ndim != 3 or volume.dtype not in (np.uint16, np.int16, np.float32) or 0 in volume.shape:
         raise InputError(
             f"volume must be a non-empty (H, W, D) array of uint16, int16 or float32, got {volume.dtype} {volume.shape}"
@@ -176,7 +162,7 @@ def select(
     disparity = np.empty((height, width), np.float32)
     cost = np.empty((height, width), volume.dtype)
     confidence = np.empty((height, width), np.float32)
-    out = winners_like(disparity, cost, confidence, count, min_disparity, subpixel)
+    out = winners_like(disparity, cost, confidence, count, low, subpixel)
     worst = np.iinfo(volume.dtype).max if volume.dtype.kind in "iu" else np.finfo(volume.dtype).max
     blocks = tuple(range(padded // LANES))
     row = np.full((width, padded), worst, volume.dtype)

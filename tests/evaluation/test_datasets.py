@@ -82,9 +82,7 @@ def test_a_frame_of_which_only_the_truth_is_left_is_listed(kitti):
     assert [frame.name[:6] for frame in datasets.kitti2015(kitti)] == ["000001", "000003", "000007"]
 
 
-@pytest.mark.parametrize(
-    "pair", [("image_0", "image_1"), ("colored_0", "colored_1"), ("colour_0", "colour_1")]
-)
+@pytest.mark.parametrize("pair", [("image_0", "image_1"), ("colored_0", "colored_1"), ("colour_0", "colour_1")])
 def test_kitti2012(tmp_path, pair):
     write(tmp_path / pair[0] / "000000_10.png", picture(7, channels=1))
     write(tmp_path / pair[1] / "000000_10.png", picture(8, channels=1))

@@ -38,9 +38,7 @@ class FakeMatcher:
 
     made: list[dict] = []  # noqa: RUF012
 
-    def __init__(
-        self, method="zncc+sgm", *, max_disparity=128, scale=1.0, refiner=None, device="auto", **rest
-    ):
+    def __init__(self, method="zncc+sgm", *, max_disparity=128, scale=1.0, refiner=None, device="auto", **rest):
         if method == "nonsense":
             raise UnknownNameError("no cost named 'nonsense'")
         self.method, self.device = {"S4": "zncc+sgm"}.get(method, method), "cpu"
@@ -264,9 +262,7 @@ def test_skipped_frames_are_reported_once_and_fail_the_run(kitti, tmp_path, fake
 def test_an_interrupt_keeps_the_figures_so_far(kitti, tmp_path, fake):
     add(kitti, 1, noc=11, grey=66)
     out = tmp_path / "out.json"
-    done = command(
-        "--dataset", "kitti2015", "--root", kitti, "--method", "S4", "--method", "S1", "--json", out
-    )
+    done = command("--dataset", "kitti2015", "--root", kitti, "--method", "S4", "--method", "S1", "--json", out)
     assert done.exit_code == 130
     document = read(out)
     assert document["interrupted"] is True

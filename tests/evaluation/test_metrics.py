@@ -306,9 +306,7 @@ def test_authors_coarse_maps_score_as_the_loop_does():
             kind: cv2.imread(str(truth_folder / f"disp_{kind}_0" / name), cv2.IMREAD_UNCHANGED)
             for kind in ("noc", "occ")
         }
-        truth = {
-            kind: np.where(raw == 0, np.float32(NAN), raw / np.float32(256)) for kind, raw in stored.items()
-        }
+        truth = {kind: np.where(raw == 0, np.float32(NAN), raw / np.float32(256)) for kind, raw in stored.items()}
         coarse = cv2.imread(str(DATA / "authors_coarse" / "disp" / name), cv2.IMREAD_UNCHANGED)
         height, width = stored["noc"].shape
         estimate = cv2.resize(coarse.astype(np.float32) / 256, (width, height)) * np.float32(2)

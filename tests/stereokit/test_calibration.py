@@ -79,9 +79,7 @@ def test_cx1_defaults_to_cx0():
 
 
 def test_half_size_gives_the_same_points():
-    calibration = Calibration(
-        fx=700, fy=690, cx0=31.5, cy=12.5, baseline_m=0.54, cx1=36.5, width=64, height=32
-    )
+    calibration = Calibration(fx=700, fy=690, cx0=31.5, cy=12.5, baseline_m=0.54, cx1=36.5, width=64, height=32)
     half = calibration.scaled(0.5)
     assert (half.width, half.height, half.fx, half.baseline_m, half.cx0) == (32, 16, 350, 0.54, 15.5)
     assert half.doffs == pytest.approx(2.5)
@@ -138,9 +136,7 @@ def test_kitti(tmp_path):
     grey = read_calibration(path, cameras=(0, 1))
     assert grey.baseline_m == pytest.approx(387.5744 / 721.5377)  # 0.5372 m
     assert grey.width is None
-    path.write_text(
-        "".join(line.replace("P_rect_0", "P") + "\n" for line in KITTI.splitlines() if line[0] == "P")
-    )
+    path.write_text("".join(line.replace("P_rect_0", "P") + "\n" for line in KITTI.splitlines() if line[0] == "P"))
     assert read_calibration(path).baseline_m == color.baseline_m
     with pytest.raises(FileError, match="to the right"):
         read_calibration(path, cameras=(1, 0))

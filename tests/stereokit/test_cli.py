@@ -45,9 +45,7 @@ class FakeMatcher:
         disparity = np.full(left.shape[:2], 10, np.float32)
         disparity[:, 0] = np.nan
         confidence = np.full(left.shape[:2], 0.5, np.float32) if FakeMatcher.confident else None
-        return Disparity(
-            disparity, ~np.isnan(disparity), confidence, disparity + 1 if self.with_right else None
-        )
+        return Disparity(disparity, ~np.isnan(disparity), confidence, disparity + 1 if self.with_right else None)
 
 
 @pytest.fixture(autouse=True)
@@ -168,9 +166,7 @@ def test_match_passes_every_option(tmp_path, pair):
 def test_match_writes_everything_else(tmp_path, pair):
     names = {"color": "c.png", "right": "r.pfm", "confidence": "k.npy", "ply": "p.ply", "json": "j.json"}
     options = [word for name, file in names.items() for word in (f"--{name}", tmp_path / file)]
-    result = run(
-        "match", *pair, "-o", tmp_path / "d.png", *options, "--calibration", tmp_path / "calibration.json"
-    )
+    result = run("match", *pair, "-o", tmp_path / "d.png", *options, "--calibration", tmp_path / "calibration.json")
     assert result.exit_code == 0, result.output
     assert FakeMatcher.made[0]["right"] is True
     assert FakeMatcher.made[0]["confidence"] is True
@@ -182,9 +178,7 @@ def test_match_writes_everything_else(tmp_path, pair):
     assert (np.load(tmp_path / "k.npy") == 0.5).all()
     cloud = (tmp_path / "p.ply").read_bytes()
     assert b"element vertex 42\n" in cloud  # 6 * 7 pixels of finite depth
-    vertices = np.frombuffer(
-        cloud.split(b"end_header\n", 1)[1], np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    )
+    vertices = np.frombuffer(cloud.split(b"end_header\n", 1)[1], np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
     np.testing.assert_allclose(vertices["xyz"][0], [0.01, 0, 1])  # pixel (1, 0) at 100 * 0.1 / 10 metres
     assert vertices["rgb"][0].tolist() == [3, 4, 5]
     report = json.loads((tmp_path / "j.json").read_text())
@@ -216,9 +210,7 @@ def test_confidence_as_a_picture(tmp_path, pair):
     assert run("match", *pair, "-o", tmp_path / "d.npy", "--confidence", tmp_path / "k.png").exit_code == 0
     assert (io.read_image(tmp_path / "k.png") == 32768).all()  # 0.5 * 65535, rounded to even
     FakeMatcher.confident = False
-    assert "--confidence" in error_of(
-        run("match", *pair, "-o", tmp_path / "d.npy", "--confidence", tmp_path / "k.png")
-    )
+    assert "--confidence" in error_of(run("match", *pair, "-o", tmp_path / "d.npy", "--confidence", tmp_path / "k.png"))
 
 
 def test_json_to_the_terminal(tmp_path, pair):

@@ -221,9 +221,9 @@ def test_a_row_cost_sees_bad_pixels_as_no_evidence(random_pair, added_cost):
     ("make", "message"),
     [
         (lambda: RowCost(None, 60), "function of a row cost must be callable, got None"),
-        (lambda: RowCost(absolute_difference, 0), "cost_max must be an integer from 1 to 254, got 0"),
-        (lambda: RowCost(absolute_difference, 255), "cost_max must be an integer from 1 to 254, got 255"),
-        (lambda: RowCost(absolute_difference, 1.5), "cost_max must be an integer from 1 to 254, got 1.5"),
+        (lambda: RowCost(absolute_difference, 0), "cost_max must be from 1 to 254, got 0"),
+        (lambda: RowCost(absolute_difference, 255), "cost_max must be from 1 to 254, got 255"),
+        (lambda: RowCost(absolute_difference, 1.5), "cost_max must be an integer, got 1.5"),
     ],
 )
 def test_row_costs_are_checked(make, message):

@@ -17,7 +17,7 @@ from stereokit import OptionError, RowCost, aggregate
 
 SHAPES = [(7, 9), (1, 9), (9, 1), (1, 1), (5, 6)]
 VECTOR = json.loads((Path(__file__).parent / "dtfilter_vector.json").read_text())
-STEP = 128
+STEP = 64
 """Units of the fixed-point result to one unit of cost."""
 
 
@@ -109,7 +109,10 @@ def test_fixed_point_on_a_flat_guide(pattern):
     }[pattern]
     for sigma in (10, 60):
         options = {"sigma_s": sigma, "sigma_r": 30, "sigma_v": None, "passes": 1}
-        assert fixed_point_error(volume, guide, 62, **options) < bound(62)
+        # A recursion with feedback a that loses up to one unit in the last place at each step loses at most
+        # 1 / (1 - a) of them; once along the rows and once along the columns.
+        lost = 1 / STEP / (1 - np.exp(-np.sqrt(2) / sigma))
+        assert fixed_point_error(volume, guide, 62, **options) < 2.0 ** -(8 - 6) / 2 + 2 * lost
 
 
 @pytest.mark.parametrize("count", [1, 64, 65, 130])
@@ -178,7 +181,7 @@ def test_any_positive_sigma_is_a_filter_or_a_clear_error(name, scale):
     ("options", "words"),
     [
         ({"mode": "nc"}, ["mode", "rf", "sum", "nc"]),
-        ({"sigma_s": 0}, ["sigma_s", "positive", "0"]),
+        ({"sigma_s": 0}, ["sigma_s", "0.01", "0"]),
         ({"sigma_s": float("nan")}, ["sigma_s", "nan"]),
         ({"sigma_r": float("inf")}, ["sigma_r", "inf"]),
         ({"sigma_r": "wide"}, ["sigma_r", "wide"]),

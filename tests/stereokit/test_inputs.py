@@ -323,7 +323,7 @@ def test_options_outside_their_rule_are_named(options, words):
     ("options", "words"),
     [
         ({"window": 4}, ["window", "odd", "4"]),
-        ({"window": 1}, ["window", "odd", "1"]),
+        ({"window": 1}, ["window", "from 3", "1"]),
         ({"window": 5.0}, ["window", "5.0"]),
         ({"window": "5x5"}, ["window", "5x5"]),
         ({"window": 257}, ["window", "255", "257"]),

@@ -28,9 +28,7 @@ def png(path, rows, depth, color_type, palette=None):
     head = struct.pack(">IIBBBBB", width, len(rows), depth, color_type, 0, 0, 0)
     body = zlib.compress(b"".join(b"\0" + row for row in rows))
     colors = chunk(b"PLTE", palette) if palette else b""
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + colors + chunk(b"IDAT", body) + chunk(b"IEND", b"")
-    )
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + colors + chunk(b"IDAT", body) + chunk(b"IEND", b""))
 
 
 def test_read_image_gives_rgb_and_drops_alpha(tmp_path):
@@ -150,12 +148,8 @@ def test_png_that_is_no_kitti_map_is_refused(tmp_path, kind):
         io.read_disparity(tmp_path / "d.png")
 
 
-@pytest.mark.parametrize(
-    "header", [b"Pf\n3 2\n%s\n", b"Pf \n3 2 \n%s\n", b"Pf 3 2 %s ", b"Pf\r\n3 2\r\n%s\r\n"]
-)
-@pytest.mark.parametrize(
-    ("scale", "order"), [(b"-1.0", "<"), (b"1", ">"), (b"-0.003922", "<"), (b"2.5e-1", ">")]
-)
+@pytest.mark.parametrize("header", [b"Pf\n3 2\n%s\n", b"Pf \n3 2 \n%s\n", b"Pf 3 2 %s ", b"Pf\r\n3 2\r\n%s\r\n"])
+@pytest.mark.parametrize(("scale", "order"), [(b"-1.0", "<"), (b"1", ">"), (b"-0.003922", "<"), (b"2.5e-1", ">")])
 def test_pfm_is_bottom_up_in_the_order_of_its_scale(tmp_path, header, scale, order):
     rows = struct.pack(f"{order}6f", 4, 5, INF, 1, -2, NAN)  # the bottom row first
     (tmp_path / "d.pfm").write_bytes(header % scale + rows)
@@ -213,9 +207,7 @@ def test_npy_of_other_numbers_is_cast_and_objects_are_refused(tmp_path):
         io.read_disparity(tmp_path / "d.npy")
 
 
-@pytest.mark.parametrize(
-    "call", [io.read_disparity, lambda p: io.write_disparity(p, np.ones((2, 2), np.float32))]
-)
+@pytest.mark.parametrize("call", [io.read_disparity, lambda p: io.write_disparity(p, np.ones((2, 2), np.float32))])
 def test_unknown_suffix_names_the_known_ones(tmp_path, call):
     with pytest.raises(FileError, match=r"\.png, \.pfm, \.npy, \.tiff, got .*d\.jpg"):
         call(tmp_path / "d.jpg")
@@ -283,9 +275,7 @@ def test_opencv_fixed_point_by_hand():
 def test_opencv_fixed_point_agrees_with_the_matcher():
     rng = np.random.default_rng(3)
     left = rng.integers(0, 256, (40, 80), np.uint8)
-    fixed = cv2.StereoSGBM.create(minDisparity=2, numDisparities=16, blockSize=5).compute(
-        left, np.roll(left, -5, 1)
-    )
+    fixed = cv2.StereoSGBM.create(minDisparity=2, numDisparities=16, blockSize=5).compute(left, np.roll(left, -5, 1))
     disparity = io.from_opencv(fixed, 2)
     assert np.isnan(disparity).any()
     assert np.median(disparity[np.isfinite(disparity)]) == 5

@@ -252,12 +252,13 @@ def test_maps_are_dense_whatever_the_images(method, scale, shape, content):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("levels", [(5, 32), (40, 60), (-60, -40)])
-def test_maps_are_dense_or_have_nothing_to_fill_from(random_pair, method, levels):
-    """Without one valid pixel `fill` has nothing to take and leaves the map as it is."""
+def test_maps_are_dense_or_the_smallest_disparity(random_pair, method, levels):
+    """Without one valid pixel there is nothing to fill from: the map is the smallest disparity everywhere."""
     left, right = random_pair(9, 30, seed=11)
     result = Matcher(method, min_disparity=levels[0], max_disparity=levels[1])(left, right)
-    gaps = np.isnan(result.disparity)
-    assert gaps.all() if not result.valid.any() else not gaps.any()
+    assert not np.isnan(result.disparity).any()
+    if not result.valid.any():
+        assert (result.disparity == levels[0]).all()
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -79,9 +79,7 @@ def test_turbo_runs_from_blue_to_red_and_invalid_is_black():
 def test_the_automatic_range_ignores_the_last_percent():
     disparity = np.arange(1000, dtype=np.float32).reshape(20, 50)
     disparity[-1, -1] = 1e6
-    np.testing.assert_array_equal(
-        colorize(disparity), colorize(disparity, 0, float(np.percentile(disparity, 99)))
-    )
+    np.testing.assert_array_equal(colorize(disparity), colorize(disparity, 0, float(np.percentile(disparity, 99))))
     result = Disparity(disparity, np.ones_like(disparity, bool))
     np.testing.assert_array_equal(result.color(), colorize(disparity))
     np.testing.assert_array_equal(result.color(min=10, max=30), colorize(disparity, 10, 30))

@@ -1,0 +1,423 @@
+"""The bench: statistics and ratios by hand numbers, the command at a tiny size. No test asserts a speed."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from stereokit import matching
+from stereokit.cli import app
+from stereokit.errors import OptionError, StereokitError, UnknownNameError
+from stereokit_evaluation import _peers, _speed_report, speed
+from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
+from stereokit_evaluation._rounds import ratio, round_robin, spread
+from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
+from stereokit_evaluation._stage_times import OTHER, TOTAL, _Watch, stage_times
+
+TINY = "64x48x16"
+
+
+def bench(*words):
+    return CliRunner().invoke(app, ["bench", *map(str, words)])
+
+
+@pytest.fixture
+def one_peer(monkeypatch):
+    monkeypatch.setattr(speed, "peers", lambda: [_peers.THREE_WAY])
+
+
+# sizes and threads
+
+
+def test_sizes_are_those_of_the_bars():
+    k, m, h = speed.parse_sizes("K,m, H")
+    assert (k.width, k.height, k.levels) == (1242, 375, 128)
+    assert (m.width, m.height, m.levels) == (1342, 1110, 256)
+    assert (h.width, h.height, h.levels) == (621, 188, 64)
+    assert h.cells == 621 * 188 * 64
+
+
+def test_free_sizes_and_repeats():
+    assert speed.parse_sizes("4000X3000x256,K,4000x3000x256") == [
+        Size("4000x3000x256", 4000, 3000, 256),
+        SIZES["K"],
+    ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "Q", "K,", "64x48", "64x48x16x2", "-64x48x16", "0x48x16", "64x0x16", "64x48x1", "64x48x64", "9999x9x2049"],
+)
+def test_bad_sizes_are_refused(text):
+    with pytest.raises(OptionError, match="sizes must be"):
+        speed.parse_sizes(text)
+
+
+def test_threads():
+    assert speed.parse_threads("2, 1,2") == [2, 1]
+    for text in ("", "0", "-1", "1.5", "1,,2", "two", "99999"):
+        with pytest.raises(OptionError, match="threads must be whole numbers"):
+            speed.parse_threads(text)
+
+
+# statistics
+
+
+def test_round_robin_takes_turns_and_times_with_its_clock():
+    now = 0.0
+    order = []
+
+    def costs(name, seconds):
+        def call():
+            nonlocal now
+            order.append(name)
+            now += seconds[len([n for n in order if n == name]) - 1]
+
+        return call
+
+    times, told = {}, []
+    calls = {"a": costs("a", [1, 2, 4]), "b": costs("b", [10, 20, 30]), "c": costs("c", [5])}
+    round_robin(calls, 3, times, most={"c": 1}, clock=lambda: now, step=told.append)
+    assert order == told == ["a", "b", "c", "a", "b", "a", "b"]
+    assert times == {"a": [1, 2, 4], "b": [10, 20, 30], "c": [5]}
+
+
+def test_round_robin_leaves_what_it_has_when_it_is_stopped():
+    times = {}
+    runs = iter([None, None, KeyboardInterrupt])
+
+    def call():
+        if next(runs) is not None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        round_robin({"a": call, "b": call}, 5, times)
+    assert {name: len(seconds) for name, seconds in times.items()} == {"a": 1, "b": 1}
+
+
+def test_spread_by_hand():
+    found = spread([4.0, 1.0, 3.0, 2.0, 10.0])
+    assert (found.least, found.q25, found.median, found.q75, found.runs) == (1, 2, 3, 4, 5)
+    assert spread([1.0, 2.0]).median == 1.5
+    one = spread([7.0])
+    assert (one.least, one.q25, one.median, one.q75, one.runs) == (7, 7, 7, 7, 1)
+    with pytest.raises(OptionError):
+        spread([])
+
+
+def test_ratio_says_how_many_times_faster():
+    assert ratio(spread([30.0]), spread([10.0])) == 3
+    assert ratio(spread([5.0]), spread([10.0])) == 0.5
+    assert ratio(None, spread([10.0])) is None
+    assert ratio(spread([10.0]), None) is None
+    assert ratio(spread([10.0]), spread([0.0])) is None
+
+
+# report
+
+
+@pytest.fixture
+def findings():
+    """Two threads only; HH 300 ms, 3WAY 20 ms, ours 30 ms: ten times faster than one and slower than the other."""
+    size = Size("100x10x50", 100, 10, 50)
+    found = Findings(methods=["census+sgm"], sizes=[size], threads=[2], rounds=3)
+    found.times[size.name, 2] = {
+        "census+sgm": [0.03, 0.02, 0.05],
+        _peers.HH: [0.3, 0.3, 0.3],
+        _peers.THREE_WAY: [0.02, 0.01, 0.03],
+    }
+    found.memory = {(size.name, "census+sgm"): 50.0, (size.name, _peers.HH): 200.0, (size.name, _peers.THREE_WAY): None}
+    found.first, found.first_size = {"census+sgm": {"import_s": 0.5, "call_s": 0.25}}, size.name
+    return found
+
+
+def test_rows_hold_medians_and_ratios(findings):
+    ours, hh, three_way = findings.rows()
+    assert ours["contender"] == "S2 census+sgm" and ours["kind"] == "method" and hh["kind"] == "peer"
+    assert ours["median_ms"] == pytest.approx(30) and ours["min_ms"] == pytest.approx(20)
+    assert (ours["q25_ms"], ours["q75_ms"]) == pytest.approx((25, 40))
+    assert ours["x_hh"] == pytest.approx(10) and ours["x_3way"] == pytest.approx(2 / 3)
+    assert hh["x_hh"] == three_way["x_3way"] == 1
+    assert ours["mde_per_s"] == pytest.approx(50_000 / 0.03 / 1e6)
+
+
+def test_memory_is_compared_with_hh(findings):
+    memory = {entry["key"]: entry for entry in as_json(findings, {})["memory"]}
+    assert memory["census+sgm"]["of_hh"] == 0.25
+    assert memory[_peers.THREE_WAY]["mb"] is None and memory[_peers.THREE_WAY]["of_hh"] is None
+
+
+def test_ratios_need_their_peer(findings):
+    del findings.times["100x10x50", 2][_peers.HH]
+    assert findings.rows()[0]["x_hh"] is None
+
+
+def test_tables_publish_losses(findings, capsys):
+    findings.stages["100x10x50", "census+sgm"] = {"smooth": 1.0, OTHER: 0.5, TOTAL: 1.5}
+    findings.skip(findings.sizes[0], "OpenCV HH4", 2, "needs [1] GB")
+    findings.load = [3.25, 2.0, 1.0]
+    print_tables(findings)
+    text = capsys.readouterr().out
+    ours = next(line for line in text.splitlines() if line.startswith(" S2 census+sgm") or "S2 census+sgm  " in line)
+    assert "10.00" in ours and "0.67" in ours and "0.25" in ours
+    assert "left out: OpenCV HH4, 100x10x50, 2 threads: needs [1] GB" in text
+    assert "smooth" in text and "total" in text and "load 3.2 at the start" in text
+
+
+def test_a_ratio_below_one_stands_out_for_methods_only():
+    assert _speed_report._times_faster(0.5, "method") == "[bold red]0.50[/]"
+    assert _speed_report._times_faster(0.5, "peer") == "0.50"
+    assert _speed_report._times_faster(1.5, "method") == "1.50"
+    assert _speed_report._times_faster(None, "method") == "-"
+
+
+# contenders
+
+
+def test_labels_and_makers():
+    assert _peers.label("zncc+sgm") == "S4 zncc+sgm"
+    assert _peers.label(_peers.HH) == _peers.HH
+    with pytest.raises(UnknownNameError):
+        _peers.make("S9", 16, 1)
+
+
+def test_opencv_takes_the_next_multiple_of_16():
+    assert [_peers.usable_levels(levels) for levels in (1, 16, 17, 256)] == [16, 16, 32, 256]
+
+
+@pytest.mark.parametrize("name", _peers.peers())
+def test_every_peer_finds_a_shift(name):
+    rng = np.random.default_rng(0)
+    left = cv2.resize(rng.integers(0, 256, (20, 40), np.uint8), (160, 60), interpolation=cv2.INTER_CUBIC)
+    found = _peers.make(name, 16, 1)(left, np.roll(left, -6, axis=1)).astype(np.float64)
+    unit = 16 if name.startswith("OpenCV") else 1
+    assert found.shape == (60, 160)
+    assert np.nanmedian(found[:, 40:] / unit) == pytest.approx(6, abs=0.2)
+
+
+def test_a_peer_that_the_machine_cannot_hold_is_left_out(monkeypatch):
+    monkeypatch.setattr(speed, "_free_bytes", lambda: 1e9)
+    big = Size("big", 4000, 3000, 256)
+    assert speed._too_large(_peers.HH, big) == "needs 12.3 GB of memory, 1.0 GB are free"
+    assert speed._too_large(_peers.HH, SIZES["K"]) is None
+    assert speed._too_large("census+sgm", big) is None
+    monkeypatch.setattr(speed, "_free_bytes", lambda: None)
+    assert speed._too_large(_peers.HH, big) is None
+
+
+# stages and probes
+
+
+def test_nested_stages_do_not_count_twice():
+    ticks = iter([0.0, 1.0, 4.0, 10.0])  # outer begins, inner begins, inner ends, outer ends
+    watch = _Watch(lambda: next(ticks))
+    inner = watch.wrap("inner", lambda: "result")
+    outer = watch.wrap("outer", lambda: inner())
+    assert outer() == "result"
+    assert watch.seconds == {"outer": 7.0, "inner": 3.0}
+
+
+def test_stages_add_up_and_leave_the_core_as_it_was(random_pair):
+    left, right = random_pair(24, 64)
+    before = dict(vars(matching)), dict(vars(type(matching.Matcher("S2").cost)))
+    found = stage_times("census+sgm", 16, left, right, 1)
+    assert (dict(vars(matching)), dict(vars(type(matching.Matcher("S2").cost)))) == before
+    assert list(found)[-2:] == [OTHER, TOTAL]
+    assert sum(found.values()) == pytest.approx(2 * found[TOTAL])
+    assert "prepare cost" in found and len(found) > 4
+
+
+def test_stages_of_an_unknown_core_are_other(monkeypatch):
+    def plain(method, **options):
+        return lambda left, right: None
+
+    monkeypatch.setattr(matching, "Matcher", plain)
+    ticks = iter([0.0, 2.0])
+    found = stage_times("any", 16, np.zeros(1, np.uint8), np.zeros(1, np.uint8), 1, clock=lambda: next(ticks))
+    assert found == {OTHER: 2000.0, TOTAL: 2000.0}
+
+
+def test_probes_measure_in_new_processes(random_pair):
+    with stored(*random_pair(48, 64)) as files:
+        memory = memory_added(_peers.THREE_WAY, 16, 1, files)
+        assert memory is None or 0 <= memory < 1000
+        first = first_call("census+sgm", 16, 1, files)
+        assert set(first) == {"import_s", "call_s"} and min(first.values()) > 0
+        with pytest.raises(ProbeError, match=r"first probe: .*no cost named 'nonsense'"):
+            first_call("nonsense+sgm", 16, 1, files)
+
+
+# command
+
+
+def test_json_has_everything(tmp_path, one_peer):
+    target = tmp_path / "bench.json"
+    threads = cv2.getNumThreads()
+    done = bench(
+        "--sizes", TINY, "--threads", "1,2", "--method", "S2", "--rounds", 1, "--stages", "--no-first-call",
+        "--json", target,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert cv2.getNumThreads() == threads
+    assert "S2 census+sgm" in done.stdout and _peers.THREE_WAY in done.stdout and "stages" in done.stdout
+    found = json.loads(target.read_text())
+    assert list(found) == [
+        "results", "memory", "first_call", "stages", "skipped", "sizes", "options", "interrupted",
+        "versions", "machine",
+    ]  # fmt: skip
+    assert [(row["key"], row["threads"], row["runs"]) for row in found["results"]] == [
+        ("census+sgm", 1, 1), (_peers.THREE_WAY, 1, 1), ("census+sgm", 2, 1), (_peers.THREE_WAY, 2, 1),
+    ]  # fmt: skip
+    row = found["results"][0]
+    assert row["min_ms"] == row["median_ms"] == row["samples_ms"][0] > 0
+    assert row["x_3way"] > 0 and row["x_hh"] is None
+    assert found["memory"] == found["first_call"] == found["skipped"] == []
+    assert found["stages"][0]["ms"]["total"] > 0
+    assert found["sizes"][TINY] == {"width": 64, "height": 48, "max_disparity": 16, "opencv_disparities": 16}
+    assert found["options"]["threads"] == [1, 2] and found["options"]["images"] == "synthetic"
+    assert set(found["versions"]) >= {"stereokit", "numba", "numpy", "opencv", "python"}
+    assert found["machine"]["vector_bits"] in (128, 256, 512) and found["machine"]["cpu"]
+    assert found["interrupted"] is False
+
+
+def test_real_images_without_peers_to_standard_output(tmp_path, random_pair):
+    for name, image in zip(("l.png", "r.png"), random_pair(96, 128), strict=True):
+        assert cv2.imwrite(str(tmp_path / name), image)
+    images = "--left", tmp_path / "l.png", "--right", tmp_path / "r.png"
+    done = bench(
+        "--sizes", TINY, "--threads", 1, "--method", "census+sgm", "--rounds", 2, "--no-peers", "--no-first-call",
+        *images, "--json", "-",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert [row["runs"] for row in found["results"]] == [2]
+    assert found["options"]["images"] == [str(tmp_path / "l.png"), str(tmp_path / "r.png")]
+
+
+def test_memory_and_first_call_are_asked_for_where_they_should(monkeypatch, one_peer):
+    monkeypatch.setitem(SIZES, "K", Size("K", 80, 24, 16))
+    monkeypatch.setitem(SIZES, "H", Size("H", 60, 24, 16))
+    monkeypatch.setattr(speed, "memory_added", lambda key, levels, threads, files: 2.0 if "+" in key else 4.0)
+    firsts = iter([9.0, 1.0, 2.0])
+    monkeypatch.setattr(speed, "first_call", lambda *given: {"import_s": 1.0, "call_s": next(firsts)})
+    words = "--sizes", "H,K", "--threads", "2", "--method", "S2", "--rounds", "2", "--json", "-"
+    found = json.loads(bench(*words).stdout)
+    assert [(entry["size"], entry["mb"]) for entry in found["memory"]] == [("K", 2.0), ("K", 4.0)]
+    assert [(entry["size"], entry["call_s"]) for entry in found["first_call"]] == [("K", 1.5)]  # not the first, 9
+    found = json.loads(bench(*words, "--memory", "--no-first-call").stdout)
+    assert [entry["size"] for entry in found["memory"]] == ["H", "H", "K", "K"]
+    assert json.loads(bench(*words, "--no-memory", "--no-first-call").stdout)["memory"] == []
+
+
+def test_a_probe_that_fails_says_why(monkeypatch, one_peer):
+    def fails(*given):
+        raise ProbeError("out of luck")
+
+    monkeypatch.setattr(speed, "memory_added", fails)
+    monkeypatch.setattr(speed, "first_call", fails)
+    words = "--sizes", TINY, "--threads", "1", "--method", "S2", "--rounds", "1", "--memory", "--json", "-"
+    found = json.loads(bench(*words).stdout)
+    assert found["memory"] == found["first_call"] == []
+    assert [skip["reason"] for skip in found["skipped"]] == ["out of luck"] * 3
+
+
+def stub(monkeypatch, calls):
+    """Make the contenders do what the test says."""
+    monkeypatch.setattr(speed, "make", lambda key, levels, threads: calls[key])
+
+
+def test_an_interrupt_prints_what_there_is(monkeypatch, one_peer):
+    runs = iter([None, None, None, KeyboardInterrupt])
+
+    def peer(left, right):
+        if next(runs) is not None:
+            raise KeyboardInterrupt
+
+    stub(monkeypatch, {"census+sgm": lambda left, right: None, _peers.THREE_WAY: peer})
+    done = bench("--sizes", f"{TINY},K", "--threads", 1, "--method", "S2", "--rounds", 5, "--json", "-")
+    assert done.exit_code == 130
+    found = json.loads(done.stdout)
+    assert found["interrupted"] and [row["runs"] for row in found["results"]] == [3, 2]
+    assert "interrupted" in done.stderr
+
+
+def test_a_peer_that_fails_is_left_out_but_a_method_is_not(monkeypatch, one_peer):
+    def fails(left, right):
+        raise RuntimeError("two\nlines")
+
+    words = "--sizes", TINY, "--threads", 1, "--method", "S2", "--rounds", 1, "--no-first-call", "--json", "-"
+    stub(monkeypatch, {"census+sgm": lambda left, right: None, _peers.THREE_WAY: fails})
+    found = json.loads(bench(*words).stdout)
+    assert [row["key"] for row in found["results"]] == ["census+sgm"]
+    assert found["skipped"] == [{"size": TINY, "contender": _peers.THREE_WAY, "threads": 1, "reason": "two lines"}]
+    stub(monkeypatch, {"census+sgm": fails, _peers.THREE_WAY: fails})
+    assert isinstance(bench(*words).exception, RuntimeError)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--sizes", "Q"), "sizes must be K, M, H or WxHxD such as 640x480x64, with commas, got 'Q'"),
+        (("--threads", "0"), "threads must be whole numbers"),
+        (("--method", "S9"), "no method named 'S9'"),
+        (("--rounds", "0"), "rounds must be at least 1, got 0"),
+        (("--left", "l.png"), "left and right go together"),
+        (("--left", "none.png", "--right", "none.png"), "none.png"),
+        (("--json", "no/such/folder.json"), "json 'no/such/folder.json'"),
+    ],
+)
+def test_bad_input_exits_with_2_and_one_line(words, said, monkeypatch):
+    monkeypatch.setattr(speed, "_time", lambda *given: pytest.fail("it began to work"))
+    done = bench(*words)
+    assert done.exit_code == 2
+    assert done.stderr.startswith("error: ") and said in done.stderr and done.stderr.count("\n") == 1
+    assert not done.stdout
+
+
+def test_pictures_must_match(tmp_path, random_pair):
+    for name, shape in (("l.png", (40, 80)), ("r.png", (40, 90))):
+        assert cv2.imwrite(str(tmp_path / name), random_pair(*shape)[0])
+    done = bench("--left", tmp_path / "l.png", "--right", tmp_path / "r.png")
+    assert done.exit_code == 2 and "same size" in done.stderr
+
+
+def test_progress_is_drawn_between_calls_only(monkeypatch):
+    made = []
+
+    class Bar:
+        def __init__(self, *columns, **options):
+            made.append(options)
+            self.live = SimpleNamespace(is_started=False)
+            self.refreshed = 0
+
+        def add_task(self, *given, **options):
+            return 0
+
+        update = start = stop = add_task
+
+        def refresh(self):
+            self.refreshed += 1
+            made.append(self.refreshed)
+
+    monkeypatch.setattr(speed, "Progress", Bar)
+    now = iter([0.0, 0.5, 1.5, 1.6])
+    monkeypatch.setattr(speed.time, "monotonic", lambda: next(now))
+    with speed._progress(3) as (_, step):
+        for _ in range(3):
+            step("one")
+    assert made[0]["auto_refresh"] is False
+    assert made[1:] == [1]
+
+
+def test_scenes_without_scikit_image_say_so(monkeypatch):
+    def missing(*given):
+        raise StereokitError("scikit-image is not installed")
+
+    monkeypatch.setattr(speed, "generate", missing)
+    done = bench("--sizes", TINY, "--method", "S2")
+    assert done.exit_code == 2 and "scikit-image" in done.stderr

@@ -22,8 +22,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "subpixel": True,
         "uniqueness": 0,
     },
-    "census+dt": {"smooth": 0.7, "speckle": 0.0003, "window": "7x7"},
-    "census+sgm": {"p1": 30, "p2": 170, "window": "7x7"},
+    "census+dt": {"smooth": 0.7, "speckle": 0.0003, "window": "5x5"},
+    "census+sgm": {"p1": 15, "p2": 85, "window": "5x5"},
     "zncc+dt": {"smooth": 0.7, "speckle": 0.0003, "window": 3},
     "zncc+sgm": {"p1": 20 / 31, "p2": 120 / 31},
 }

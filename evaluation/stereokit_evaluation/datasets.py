@@ -189,9 +189,7 @@ def _scene(index: int) -> Any:
     return import_module("stereokit_evaluation.scenes").generate(index, *_SCENE_SIZE)
 
 
-def _kitti(
-    title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth: Sequence[str]
-) -> list[Frame]:
+def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth: Sequence[str]) -> list[Frame]:
     given = _root(root)
     base = given / "training" if (given / "training").is_dir() else given
     a, b = next((pair for pair in pairs if (base / pair[0]).is_dir()), pairs[0])
@@ -253,9 +251,7 @@ def _levels(path: Path, levels: int, widest: int) -> NDArray[np.float32]:
     if image.dtype != np.uint8:
         raise FileError(f"{path} must be an 8-bit disparity map, got {image.dtype}")
     if image.shape[1] > widest:
-        raise FileError(
-            f"{path} must be at most {widest} px wide at {levels} levels a pixel, got {image.shape[1]}"
-        )
+        raise FileError(f"{path} must be at most {widest} px wide at {levels} levels a pixel, got {image.shape[1]}")
     disparity: NDArray[np.float32] = image.astype(np.float32) / np.float32(levels)
     disparity[image == 0] = np.nan
     return disparity

@@ -70,9 +70,7 @@ def evaluate(
     refiner: Annotated[str | None, typer.Option(help="Refiner for the half-size map.")] = None,
     predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")
-    ] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")] = None,
     max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     color: Annotated[bool, typer.Option("--color/--gray", help="Images as stored, or grey.")] = False,

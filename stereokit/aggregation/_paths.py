@@ -2,8 +2,9 @@
 
 Where what lives (``P`` levels to a pixel, one byte each, all rows of one worker fit its caches)::
 
-    cost    (W, P)      costs of the row at hand, from the cost's row producer
-    across  (W, P)      sum of the brackets of the two horizontal paths of that row
+    cost    (2, W, P)   costs of two rows, from the cost's row producer
+    across  (2, W, P)   sums of the brackets of the two paths along each of those rows
+    chains  (4, P)      the path costs that those four paths have got to
     state   (3, W, P)   path costs of the three paths that come from the row before
     least   (3, W)      the smallest path cost of each
     total   (W, P)      16 bit, sum over all paths: what selection reads
@@ -45,7 +46,7 @@ from stereokit.kernels.simd import (
     subtract,
 )
 
-__all__ = ["PathBuffers", "first_visit", "last_visit_row", "start"]
+__all__ = ["PathBuffers", "finish_row", "first_visit", "prepare_rows", "start"]
 
 
 class PathBuffers(NamedTuple):
@@ -60,7 +61,7 @@ class PathBuffers(NamedTuple):
     chains: NDArray[np.uint8]
     state: NDArray[np.uint8]
     least: NDArray[np.uint8]
-    penalties: NDArray[np.uint8]  # (4, 2, W): p1 and p2 of each pixel for the three paths, then along the row
+    penalties: NDArray[np.uint8]  # (2, 4, 2, W): by row, p1 and p2 of each pixel for three paths, then along it
     total: NDArray[np.uint16]
 
 
@@ -80,93 +81,97 @@ def start(buffers: PathBuffers) -> None:
 
 @inline
 def _look_up(
-    guide: NDArray[np.uint8], y: int, step: int, p1: NDArray[np.uint8], p2: NDArray[np.uint8],
-    out: NDArray[np.uint8],
+    guide: NDArray[np.uint8], y: int, step: int, diagonals: bool, along: bool, p1: NDArray[np.uint8],
+    p2: NDArray[np.uint8], base: int, out: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """Penalties of row `y` for steps along the three paths of the sweep and along the row, by grey difference."""
+    """Penalties of row `y`, by grey difference, for the steps of the paths from the row before and `along` the row."""
     height, width = guide.shape
     before = min(max(y - step, 0), height - 1)
     for direction in range(3):
-        shift = direction - 1  # the path in slot x - k comes from the left, the one in x + k from the right
+        if direction == 1 or diagonals:
+            shift = direction - 1  # the path in slot x - k comes from the left, the one in x + k from the right
+            low = base + 2 * direction * width
+            for x in range(width):
+                other = min(max(x + shift, 0), width - 1)
+                jump = abs(np.int32(guide[y, x]) - np.int32(guide[before, other]))
+                out[low + x] = p1[jump]
+                out[low + width + x] = p2[jump]
+    if along:
+        low = base + 6 * width
         for x in range(width):
-            other = min(max(x + shift, 0), width - 1)
-            jump = abs(np.int32(guide[y, x]) - np.int32(guide[before, other]))
-            out[2 * direction * width + x] = p1[jump]
-            out[(2 * direction + 1) * width + x] = p2[jump]
-    for x in range(width):
-        jump = abs(np.int32(guide[y, x]) - np.int32(guide[y, max(x - 1, 0)]))
-        out[6 * width + x] = p1[jump]
-        out[7 * width + x] = p2[jump]
+            jump = abs(np.int32(guide[y, x]) - np.int32(guide[y, max(x - 1, 0)]))
+            out[low + x] = p1[jump]
+            out[low + width + x] = p2[jump]
 
 
 @inline
-def _horizontals(buffers: PathBuffers) -> None:
-    """Both paths along the row; they run as one loop because each alone would wait for its own minimum."""
-    width = buffers.width
+def _step_along(buffers: PathBuffers, chain: int, at: int, pixel: int, low: Any, first: bool) -> Any:
+    """Take one path along a row to the pixel whose costs are at `at`; return its smallest path cost in all lanes.
+
+    `chain` is where the path's last costs are kept, `pixel` whose penalties hold for the step, `low` the smallest of
+    the last costs. The bracket is put into `across`, or added to what the `first` path left there.
+    """
     padded = LANES * len(buffers.blocks)
     chains = buffers.chains
     full = splat(np.uint8(255))
-    zero = splat(np.uint8(0))
-    for block in range(0, 2 * padded, LANES):
-        store(chains, block, zero)
     like = buffers.across[0]
-    low_a = zero
-    low_b = zero
-    for x in range(width):
-        xb = width - 1 - x
-        behind = min(xb + 1, width - 1)  # the step into xb from the right has the jump between xb and xb + 1
-        p1_a = splat(buffers.penalties[6 * width + x])
-        p2_a = splat(buffers.penalties[7 * width + x])
-        p1_b = splat(buffers.penalties[6 * width + behind])
-        p2_b = splat(buffers.penalties[7 * width + behind])
-        smallest_a = full
-        smallest_b = full
-        below_a = full
-        below_b = full
-        here_a = subtract(load(chains, 0), low_a)
-        here_b = subtract(load(chains, padded), low_b)
-        for k in range(len(buffers.blocks)):
-            block = k * LANES
-            if k + 1 < len(buffers.blocks):
-                above_a = subtract(load(chains, block + LANES), low_a)
-                above_b = subtract(load(chains, padded + block + LANES), low_b)
-            else:
-                above_a = full
-                above_b = full
-            bracket_a = _bracket(below_a, here_a, above_a, p1_a, p2_a)
-            bracket_b = _bracket(below_b, here_b, above_b, p1_b, p2_b)
-            at_a = x * padded + block
-            at_b = xb * padded + block
-            cost_a = add_saturated(load(buffers.cost, at_a), bracket_a)
-            cost_b = add_saturated(load(buffers.cost, at_b), bracket_b)
-            store(chains, block, cost_a)
-            store(chains, padded + block, cost_b)
-            smallest_a = minimum(smallest_a, cost_a)
-            smallest_b = minimum(smallest_b, cost_b)
-            wide_a = convert(bracket_a, like)
-            wide_b = convert(bracket_b, like)
-            if x < xb:
-                store(buffers.across, at_a, wide_a)
-                store(buffers.across, at_b, wide_b)
-            elif x == xb:
-                store(buffers.across, at_a, add(wide_a, wide_b))
-            else:
-                store(buffers.across, at_a, add(load(buffers.across, at_a), wide_a))
-                store(buffers.across, at_b, add(load(buffers.across, at_b), wide_b))
-            below_a = here_a
-            below_b = here_b
-            here_a = above_a
-            here_b = above_b
-        low_a = splat(lowest(smallest_a))
-        low_b = splat(lowest(smallest_b))
+    p1 = splat(buffers.penalties[6 * buffers.width + pixel])
+    p2 = splat(buffers.penalties[7 * buffers.width + pixel])
+    smallest = full
+    below = full
+    here = subtract(load(chains, chain), low)
+    for block in range(0, padded, LANES):
+        above = full
+        if block + LANES < padded:
+            above = subtract(load(chains, chain + block + LANES), low)
+        bracket = _bracket(below, here, above, p1, p2)
+        path = add_saturated(load(buffers.cost, at + block), bracket)
+        store(chains, chain + block, path)
+        smallest = minimum(smallest, path)
+        wide = convert(bracket, like)
+        if not first:
+            wide = add(wide, load(buffers.across, at + block))
+        store(buffers.across, at + block, wide)
+        below = here
+        here = above
+    return splat(lowest(smallest))
 
 
 @inline
-def _verticals(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, last: bool, stored: bool) -> None:
+def _horizontals(buffers: PathBuffers, rows: int) -> None:
+    """Both paths along each of `rows` rows, 1 or 2.
+
+    They run side by side, because each alone would wait at every pixel for its own smallest cost: the processor
+    works on one chain while another waits.
+    """
+    width = buffers.width
+    padded = LANES * len(buffers.blocks)
+    size = width * padded
+    zero = splat(np.uint8(0))
+    for at in range(0, 4 * padded, LANES):
+        store(buffers.chains, at, zero)
+    right_0 = zero
+    left_0 = zero
+    right_1 = zero
+    left_1 = zero
+    for x in range(width):
+        xb = width - 1 - x
+        behind = min(xb + 1, width - 1)  # the step into xb from the right has the jump between xb and xb + 1
+        right_0 = _step_along(buffers, 0, x * padded, x, right_0, x <= xb)
+        left_0 = _step_along(buffers, padded, xb * padded, behind, left_0, x < xb)
+        if rows > 1:
+            right_1 = _step_along(buffers, 2 * padded, size + x * padded, 8 * width + x, right_1, x <= xb)
+            left_1 = _step_along(buffers, 3 * padded, size + xb * padded, 8 * width + behind, left_1, x < xb)
+
+
+@inline
+def _verticals(
+    buffers: PathBuffers, slot: int, k: int, sums: NDArray[Any], base: int, last: bool, stored: bool
+) -> None:
     """Advance the paths from the row before to sweep row `k`.
 
-    Before the last visit their brackets are added into ``sums[base:]``; at the last one everything is summed
-    into `total`, with what the other sweep left in `sums` if `stored`.
+    `slot` says which of the two rows in the buffers it is. Before the last visit their brackets are added into
+    ``sums[base:]``; at the last one everything is summed into `total`, with what the other sweep left in `sums` if `stored`.
     """
     width = buffers.width
     padded = LANES * len(buffers.blocks)
@@ -178,6 +183,8 @@ def _verticals(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, last
     times = splat(np.uint16(buffers.paths))
     like = sums[0]
     turn = k % width
+    here = slot * width * padded
+    penalties = 8 * slot * width
     for x in range(width):
         slot_a = x - turn
         if slot_a < 0:
@@ -196,12 +203,12 @@ def _verticals(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, last
             least[2 * width + slot_c] = 0
             for block in range(0, padded, LANES):
                 store(state, c + block, zero)
-        p1_a = splat(buffers.penalties[x])
-        p2_a = splat(buffers.penalties[width + x])
-        p1_b = splat(buffers.penalties[2 * width + x])
-        p2_b = splat(buffers.penalties[3 * width + x])
-        p1_c = splat(buffers.penalties[4 * width + x])
-        p2_c = splat(buffers.penalties[5 * width + x])
+        p1_a = splat(buffers.penalties[penalties + x])
+        p2_a = splat(buffers.penalties[penalties + width + x])
+        p1_b = splat(buffers.penalties[penalties + 2 * width + x])
+        p2_b = splat(buffers.penalties[penalties + 3 * width + x])
+        p1_c = splat(buffers.penalties[penalties + 4 * width + x])
+        p2_c = splat(buffers.penalties[penalties + 5 * width + x])
         low_a = splat(least[slot_a])
         low_b = splat(least[width + x])
         low_c = splat(least[2 * width + slot_c])
@@ -222,7 +229,7 @@ def _verticals(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, last
         for n in range(len(buffers.blocks)):
             block = n * LANES
             at = x * padded + block
-            cost = load(buffers.cost, at)
+            cost = load(buffers.cost, here + at)
             above_b = full
             if n + 1 < len(buffers.blocks):
                 above_b = subtract(load(state, b + block + LANES), low_b)
@@ -254,7 +261,7 @@ def _verticals(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, last
                 part = add(part, add(convert(bracket_a, like), convert(bracket_c, like)))
             if last:
                 total = add(convert(part, wide), multiply(convert(cost, wide), times))
-                total = add(total, convert(load(buffers.across, at), wide))
+                total = add(total, convert(load(buffers.across, here + at), wide))
                 if stored:
                     total = add(total, convert(load(sums, base + at), wide))
                 store(buffers.total, at, total)
@@ -280,21 +287,28 @@ def first_visit(
     for k in range(abs(y1 - y0)):
         y = y0 + k * step
         cost_row(rows, y, buffers.cost)
-        _look_up(guide, y, step, p1, p2, buffers.penalties)
-        _verticals(buffers, k, sums, y * size, False, False)
+        _look_up(guide, y, step, buffers.diagonals, False, p1, p2, 0, buffers.penalties)
+        _verticals(buffers, 0, k, sums, y * size, False, False)
 
 
 @inline
-def last_visit_row(
+def prepare_rows(
     rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], p1: NDArray[np.uint8], p2: NDArray[np.uint8],
-    y: int, step: int, k: int, sums: NDArray[Any], stored: bool,
+    y: int, step: int, count: int,
 ) -> None:  # fmt: skip
-    """Sweep row `y`, the `k`-th of its sweep; leave the sum over all paths in ``buffers.total``."""
+    """Costs, penalties and paths along the row of row `y` and, if `count` is 2, of the next one of the sweep."""
     size = buffers.width * LANES * len(buffers.blocks)
-    cost_row(rows, y, buffers.cost)
-    _look_up(guide, y, step, p1, p2, buffers.penalties)
-    _horizontals(buffers)
+    for n in range(count):
+        cost_row(rows, y + n * step, buffers.cost[n * size : (n + 1) * size])
+        base = 8 * n * buffers.width
+        _look_up(guide, y + n * step, step, buffers.diagonals, True, p1, p2, base, buffers.penalties)
+    _horizontals(buffers, count)
+
+
+@inline
+def finish_row(buffers: PathBuffers, slot: int, y: int, k: int, sums: NDArray[Any], stored: bool) -> None:
+    """Sum all paths of row `y`, the `k`-th of its sweep, into ``buffers.total``; `prepare_rows` has been there."""
     if stored:
-        _verticals(buffers, k, sums, y * size, True, True)
+        _verticals(buffers, slot, k, sums, y * buffers.width * LANES * len(buffers.blocks), True, True)
     else:
-        _verticals(buffers, k, sums, 0, True, False)
+        _verticals(buffers, slot, k, sums, 0, True, False)

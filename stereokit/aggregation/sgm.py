@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.aggregation._paths import PathBuffers, first_visit, last_visit_row, start
+from stereokit.aggregation._paths import PathBuffers, finish_row, first_visit, prepare_rows, start
 from stereokit.costs.rows import Cost, Levels
 from stereokit.errors import OptionError
 from stereokit.inputs import check_integer, check_number
@@ -131,12 +131,12 @@ class Sgm:
                 diagonals,
                 self.paths,
                 width,
-                workspace.array(f"sgm.cost{k}", size, np.uint8),
-                workspace.array(f"sgm.across{k}", size, across_dtype),
-                workspace.array(f"sgm.chains{k}", 2 * levels.padded, np.uint8),
+                workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
+                workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
+                workspace.array(f"sgm.chains{k}", 4 * levels.padded, np.uint8),
                 workspace.array(f"sgm.state{k}", 3 * size, np.uint8),
                 workspace.array(f"sgm.least{k}", 3 * width, np.uint8),
-                workspace.array(f"sgm.penalties{k}", 8 * width, np.uint8),
+                workspace.array(f"sgm.penalties{k}", 16 * width, np.uint8),
                 workspace.array(f"sgm.total{k}", size, np.uint16),
             )
             start(buffers)
@@ -172,8 +172,13 @@ def _last_visit(
 ) -> None:  # fmt: skip
     padded = LANES * len(buffers.blocks)
     size = buffers.width * padded
-    for y in range(y0, y1, step):
-        last_visit_row(rows, buffers, guide, p1, p2, y, step, k0 + (y - y0) * step, sums, stored)
+    visits = abs(y1 - y0)
+    for k in range(visits):
+        y = y0 + k * step
+        slot = k % 2
+        if slot == 0:
+            prepare_rows(rows, buffers, guide, p1, p2, y, step, min(2, visits - k))
+        finish_row(buffers, slot, y, k0 + k, sums, stored)
         if total.size > 0:
             for at in range(0, size, LANES):
                 store(total, y * size + at, load(buffers.total, at))

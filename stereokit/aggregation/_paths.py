@@ -171,7 +171,8 @@ def _verticals(
     """Advance the paths from the row before to sweep row `k`.
 
     `slot` says which of the two rows in the buffers it is. Before the last visit their brackets are added into
-    ``sums[base:]``; at the last one everything is summed into `total`, with what the other sweep left in `sums` if `stored`.
+    ``sums[base:]``; at the last one everything is summed into `total`, with what the other sweep left in `sums` if
+    `stored`.
     """
     width = buffers.width
     padded = LANES * len(buffers.blocks)

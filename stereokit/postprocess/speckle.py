@@ -57,11 +57,11 @@ def remove_speckles(
     held = workspace or Workspace()
     label, parent, count = (held.array(f"speckle.{name}", out.size, np.int32) for name in ("label", "parent", "count"))
     width = out.shape[1]
+    flat = out.reshape(-1)
     parts = spans(out.shape[0], threads)
-    run([partial(_find_regions, out, y0, y1, limit, label, parent, count) for y0, y1 in parts], threads)
+    run([partial(_find_regions, flat, width, y0, y1, limit, label, parent, count) for y0, y1 in parts], threads)
     for y0, _ in parts[1:]:
         _join_rows(out, y0, limit, label, parent, count)
-    flat = out.reshape(-1)
     run(
         [partial(_erase, flat, y0 * width, y1 * width, size, label, parent, count) for y0, y1 in parts],
         threads,
@@ -87,42 +87,43 @@ def _unite(parent: NDArray[np.int32], count: NDArray[np.int32], a: int, b: int) 
 
 @kernel
 def _find_regions(
-    disparity: NDArray[np.float32], y0: int, y1: int, limit: np.float32, label: NDArray[np.int32],
+    disparity: NDArray[np.float32], width: int, y0: int, y1: int, limit: np.float32, label: NDArray[np.int32],
     parent: NDArray[np.int32], count: NDArray[np.int32],
 ) -> None:  # fmt: skip
-    """Label the runs of rows y0..y1 and join those that touch; labels start at the first pixel's index."""
-    width = disparity.shape[1]
+    """Label the runs of rows y0..y1 of the flat map and join those that touch; labels start at the first pixel's."""
     fresh = y0 * width
     for y in range(y0, y1):
-        row = disparity[y]
-        before = disparity[max(y - 1, y0)]
-        base = y * width
-        x = 0
-        while x < width:
-            if np.isnan(row[x]):
-                label[base + x] = -1
-                x += 1
+        end = (y + 1) * width
+        above = y > y0
+        at = y * width
+        while at < end:
+            d = disparity[at]
+            if np.isnan(d):
+                label[at] = -1
+                at += 1
                 continue
             mine = np.int64(fresh)
             fresh += 1
             parent[mine] = np.int32(mine)
             count[mine] = 0
-            start = x
-            joined = np.int64(-1)  # the label above that this run was last joined to
+            start = at
+            joined = np.int32(-1)  # the label above that this run was last joined to
             while True:
-                label[base + x] = np.int32(mine)
-                if y > y0 and abs(row[x] - before[x]) <= limit:
-                    other = np.int64(label[base - width + x])
-                    if other != joined:
-                        _unite(parent, count, mine, other)
-                        joined = other
-                x += 1
-                if x >= width or not abs(row[x] - row[x - 1]) <= limit:
+                label[at] = np.int32(mine)
+                if above and abs(d - disparity[at - width]) <= limit and label[at - width] != joined:
+                    joined = label[at - width]
+                    _unite(parent, count, mine, np.int64(joined))
+                at += 1
+                if at >= end:
+                    break
+                before = d
+                d = disparity[at]
+                if not abs(d - before) <= limit:
                     break
             root = mine
             while parent[root] != root:
                 root = np.int64(parent[root])
-            count[root] += np.int32(x - start)
+            count[root] += np.int32(at - start)
 
 
 @kernel

@@ -49,7 +49,7 @@ class ZnccRows(NamedTuple):
     right_scale: NDArray[np.float32]  # 1 / sqrt(variance), 0 where there is none
     right_width: int
     steps: int
-    sums: NDArray[np.int32]  # column sums of the products around row `at`, element (half + x) * P + d
+    sums: NDArray[np.int32]  # n times the column sums around row `at`, element ((d // 64) * C + half + x) * 64 + d % 64
     at: NDArray[np.int64]  # (1,): the row whose column sums are held, or -1
 
 
@@ -190,83 +190,94 @@ def _statistics(
             square -= squares[x]
 
 
-def _products(a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
-    """Return ``a * row_a - b * row_b`` as int32 vectors; compiled code only."""
+def _products(n: int, a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
+    """Return ``n * (a * row_a - b * row_b)`` as int32 vectors, modulo 2**32; compiled code only."""
     raise NotImplementedError("compiled code only")
 
 
 @overload(_products, strict=False, jit_options={"forceinline": True})
-def _choose_products(a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
-    wide = types.int16 if row_a.scalar == types.int8 else types.int32
-    like = np.int16(0) if wide == types.int16 else np.int32(0)
+def _choose_products(n: Any, a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
+    narrow = row_a.scalar == types.int8
 
-    def products(a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
+    def of_bytes(n: Any, a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
         # Products of int8 are at most 2**14 and at least -2**14 + 2**7, so that their difference fits int16.
-        first = multiply(splat(wide(a)), convert(row_a, like))
-        second = multiply(splat(wide(b)), convert(row_b, like))
-        return convert(subtract(first, second), np.int32(0))
+        first = multiply(splat(np.int16(a)), convert(row_a, np.int16(0)))
+        second = multiply(splat(np.int16(b)), convert(row_b, np.int16(0)))
+        return multiply(convert(subtract(first, second), np.int32(0)), splat(np.int32(n)))
 
-    return products
+    def of_words(n: Any, a: Any, row_a: Any, b: Any, row_b: Any) -> Any:
+        first = multiply(splat(np.int32(n * a)), convert(row_a, np.int32(0)))
+        second = multiply(splat(np.int32(n * b)), convert(row_b, np.int32(0)))
+        return subtract(first, second)
+
+    return of_bytes if narrow else of_words
 
 
 @inline
-def _slide(rows: ZnccRows, row_in: int, row_out: int) -> None:
-    """Add the products of padded image row `row_in` to the column sums, take away those of `row_out` if >= 0."""
-    cells = rows.cells
-    columns = cells.width + 2 * rows.half
-    gone = max(row_out, 0)
+def _change(rows: ZnccRows, row_in: int, row_out: int, c: int, block: int) -> Any:
+    """Return what the column sums of padded column `c` gain when a row comes in and one goes; -1 stands for none."""
+    new = rows.left[max(row_in, 0) * rows.left_stride + c]
+    old = rows.left[max(row_out, 0) * rows.left_stride + c]
     zero = rows.left.dtype.type(0)
-    for c in range(columns):
-        new = rows.left[row_in * rows.left_stride + c]
-        old = rows.left[gone * rows.left_stride + c] if row_out >= 0 else zero
-        k = columns - 1 - c
-        for n in range(len(cells.blocks)):
-            block = n * LANES
-            theirs_new = load(rows.right, row_in * rows.right_stride + k + block)
-            theirs_old = load(rows.right, gone * rows.right_stride + k + block)
-            at = c * LANES * len(cells.blocks) + block
-            store(rows.sums, at, add(load(rows.sums, at), _products(new, theirs_new, old, theirs_old)))
+    k = rows.cells.width + 2 * rows.half - 1 - c + block
+    theirs_new = load(rows.right, max(row_in, 0) * rows.right_stride + k)
+    theirs_old = load(rows.right, max(row_out, 0) * rows.right_stride + k)
+    n = (2 * rows.half + 1) ** 2
+    return _products(n, new if row_in >= 0 else zero, theirs_new, old if row_out >= 0 else zero, theirs_old)
 
 
 @inline
-def _move(rows: ZnccRows, y: int) -> None:
-    """Bring the column sums to row `y`: one row in and one out when it is a neighbour of the last one."""
-    window = 2 * rows.half + 1
-    last = rows.at[0]
-    if last >= 0 and y == last + 1:
-        _slide(rows, y + window - 1, last)
-    elif last >= 0 and y == last - 1:
-        _slide(rows, y, last + window - 1)
-    elif y != last:
-        rows.sums[:] = 0
-        for row in range(y, y + window):
-            _slide(rows, row, -1)
-    rows.at[0] = y
+def _start_sums(rows: ZnccRows, y: int) -> None:
+    """Fill the column sums with all rows of the window around row `y` but the last."""
+    columns = rows.cells.width + 2 * rows.half
+    for n in range(len(rows.cells.blocks)):
+        for c in range(columns):
+            at = (n * columns + c) * LANES
+            total = splat(np.int32(0))
+            for row in range(y, y + 2 * rows.half):
+                total = add(total, _change(rows, row, -1, c, n * LANES))
+            store(rows.sums, at, total)
 
 
 @implements(ZnccRows)
 @kernel
 def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
-    _move(rows, y)
     cells = rows.cells
     window = 2 * rows.half + 1
+    last = rows.at[0]
+    row_in = np.int64(-1)  # of the padded image: row y of it is the top of the window around row y
+    row_out = np.int64(-1)
+    if last >= 0 and y == last + 1:
+        row_in = y + window - 1
+        row_out = last
+    elif last >= 0 and y == last - 1:
+        row_in = np.int64(y)
+        row_out = last + window - 1
+    elif y != last:
+        _start_sums(rows, y)
+        row_in = y + window - 1
+    rows.at[0] = y
     padded = LANES * len(cells.blocks)
-    count = splat(np.int32(window * window))
+    columns = cells.width + window - 1
     most = splat(np.float32(rows.steps) + np.float32(0.5))
     zero = splat(np.float32(0))
     for n in range(len(cells.blocks)):
         block = n * LANES
-        total = load(rows.sums, block)
-        for c in range(1, window):
-            total = add(total, load(rows.sums, c * padded + block))
-        for x in range(cells.width):
+        total = splat(np.int32(0))
+        for c in range(columns):
+            # One pass: a column's sum is brought to this row, then it enters the window and the oldest leaves.
+            at = (n * columns + c) * LANES
+            column = add(load(rows.sums, at), _change(rows, row_in, row_out, c, block))
+            store(rows.sums, at, column)
+            total = add(total, column)
+            x = c - window + 1
+            if x < 0:
+                continue
             k = y * rows.right_width + cells.width - 1 - x + block
             mine = splat(rows.left_sum[y * cells.width + x])
-            numerator = subtract(multiply(count, total), multiply(mine, load(rows.right_sum, k)))
+            numerator = subtract(total, multiply(mine, load(rows.right_sum, k)))
             scale = multiply(splat(rows.left_scale[y * cells.width + x]), load(rows.right_scale, k))
             rho = maximum(multiply(convert(numerator, np.float32(0)), scale), zero)
             store(out, x * padded + block, convert(subtract(most, rho), np.uint8(0)))
-            if x + 1 < cells.width:
-                total = add(total, load(rows.sums, (x + window) * padded + block))
-                total = subtract(total, load(rows.sums, x * padded + block))
+            total = subtract(total, load(rows.sums, at - (window - 1) * LANES))
     close_row(cells, y, out)

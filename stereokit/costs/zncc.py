@@ -13,7 +13,7 @@ work per cell does not grow with the window. The cost is rounded to `steps` leve
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -97,10 +97,11 @@ class Zncc:
         half = self.window // 2
         height, width = pair.left.shape
         padded = pair.levels.padded
-        pair = Pair(
-            self._in_range(pair.left), self._in_range(pair.right), pair.left_bad, pair.right_bad,
-            pair.levels, pair.outside, pair.threads,
-        )  # fmt: skip
+        pair = replace(
+            pair,
+            left=self._in_range(pair.left, "zncc.left", workspace, pair.threads),
+            right=self._in_range(pair.right, "zncc.right", workspace, pair.threads),
+        )
         left, right = pad_pair(pair, half, workspace)
         right_width = width + padded
         left_sum = workspace.array("zncc.left_sum", (height, width), np.int32)
@@ -109,7 +110,7 @@ class Zncc:
         right_scale = workspace.array("zncc.right_scale", (height, right_width), np.float32)
         tasks: list[Any] = []
         for k, (y0, y1) in enumerate(spans(height, pair.threads)):
-            work = workspace.array(f"zncc.work{k}", (2, 2, right_width + 2 * half), np.int64)
+            work = workspace.array(f"zncc.work{k}", (2, 4, right_width + 2 * half), np.int64)
             tasks.append(partial(_statistics, left, y0, y1, self.window, self.steps, work[0], left_sum, left_scale))
             tasks.append(partial(_statistics, right, y0, y1, self.window, 1, work[1], right_sum, right_scale))
         run(tasks, pair.threads)
@@ -139,16 +140,16 @@ class Zncc:
             )
         return rows
 
-    def _in_range(self, image: NDArray[Any]) -> NDArray[Any]:
+    def _in_range(self, image: NDArray[Any], name: str, workspace: Workspace, threads: int) -> NDArray[Any]:
         """Return `image` centred around 0 and, if need be, scaled to `range_max`: rho does not change."""
         if image.dtype == np.uint8 and self.range_max >= 255:
             return np.asarray((image ^ np.uint8(128)).view(np.int8))
         low, high = int(image.min()), int(image.max())
-        factor = min(1.0, self.range_max / max(high - low, 1))
-        centred = image.astype(np.float32)
-        centred -= np.float32((low + high) // 2)  # whole, or every pixel would be rounded from a half
-        centred *= np.float32(factor)
-        return np.asarray(np.rint(centred, out=centred), np.int16)
+        factor = np.float32(min(1.0, self.range_max / max(high - low, 1)))
+        middle = (low + high) // 2  # whole, or every pixel would be rounded from a half
+        out = workspace.array(name, image.shape, np.int16)
+        run([partial(_rescale, image, y0, y1, middle, factor, out) for y0, y1 in spans(len(image), threads)], threads)
+        return out
 
 
 @kernel
@@ -160,8 +161,11 @@ def _statistics(
     width = out_sum.shape[1]
     sums = work[0, : width + window - 1]
     squares = work[1, : width + window - 1]
+    total = work[2, :width]
+    square = work[3, :width]
     sums[:] = 0
     squares[:] = 0
+    n = np.int64(window * window)
     for y in range(y0, y1):
         if y == y0:
             for row in range(y, y + window):
@@ -175,19 +179,26 @@ def _statistics(
                 old = np.int64(image[y - 1, k])
                 sums[k] += new - old
                 squares[k] += new * new - old * old
-        total = np.int64(0)
-        square = np.int64(0)
-        for k in range(window - 1):
-            total += sums[k]
-            square += squares[k]
+        # Whole rows at a time, not a sliding sum: each of these loops becomes vector code.
+        total[:] = 0
+        square[:] = 0
+        for j in range(window):
+            for x in range(width):
+                total[x] += sums[x + j]
+                square[x] += squares[x + j]
         for x in range(width):
-            total += sums[x + window - 1]
-            square += squares[x + window - 1]
-            variance = np.int64(window * window) * square - total * total
-            out_sum[y, x] = np.int32(total)
-            out_scale[y, x] = np.float32(scale / np.sqrt(np.float64(variance))) if variance > 0 else np.float32(0)
-            total -= sums[x]
-            square -= squares[x]
+            variance = n * square[x] - total[x] * total[x]
+            out_sum[y, x] = np.int32(total[x])
+            root = np.sqrt(np.float64(max(variance, np.int64(1))))
+            out_scale[y, x] = np.float32(scale / root) if variance > 0 else np.float32(0)
+
+
+@kernel
+def _rescale(image: NDArray[Any], y0: int, y1: int, middle: int, factor: np.float32, out: NDArray[np.int16]) -> None:
+    """Write ``(image - middle) * factor``, rounded, for rows y0..y1."""
+    for y in range(y0, y1):
+        for x in range(image.shape[1]):
+            out[y, x] = np.int16(np.rint(np.float32(np.int32(image[y, x]) - np.int32(middle)) * factor))
 
 
 def _products(n: int, a: Any, row_a: Any, b: Any, row_b: Any) -> Any:

@@ -12,20 +12,15 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit import costs as _costs  # noqa: F401  (registers the built-in costs)
-from stereokit.aggregation import dt as _dt  # noqa: F401
-from stereokit.aggregation import sgm as _sgm  # noqa: F401
 from stereokit.costs.rows import Levels, Pair
 from stereokit.defaults import DEFAULTS, METHODS
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import (
-    MAX_DISPARITY,
     GrayPair,
     check_flag,
     check_integer,
@@ -37,6 +32,7 @@ from stereokit.inputs import (
 )
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.workspace import Pool, Workspace
+from stereokit.methods import check_levels, option_names, parse_method
 from stereokit.postprocess.fill import FILLS, fill
 from stereokit.postprocess.median import median
 from stereokit.postprocess.smp import single_matching_phase
@@ -45,9 +41,8 @@ from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
 from stereokit.selection.wta import winners_like
 
-__all__ = ["METHODS", "Matcher", "match", "parse_method", "warmup"]
+__all__ = ["METHODS", "Matcher", "match", "warmup"]
 
-_MAX_LEVELS = 2048
 _PIPELINE = (
     "confidence",
     "fill",
@@ -60,60 +55,6 @@ _PIPELINE = (
     "subpixel",
     "uniqueness",
 )
-
-
-def parse_method(method: str) -> str:
-    """Return the canonical name, ``"cost+aggregation"``, of a method given in any case, or as S1 to S4.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such method, cost or aggregation.
-    """
-    if not isinstance(method, str):
-        raise OptionError(f"method must be a name such as 'zncc+sgm' or 'S4', got {method!r}")
-    text = method.strip()
-    text = METHODS.get(text.upper(), text.lower())
-    parts = [part.strip() for part in text.split("+")]
-    if len(parts) != 2:
-        known = [*METHODS, *(f"{c}+{a}" for c in COSTS.names() for a in AGGREGATIONS.names())]
-        raise UnknownNameError(did_you_mean("method", method, known))
-    COSTS.get(parts[0])
-    AGGREGATIONS.get(parts[1])
-    return "+".join(parts)
-
-
-def check_levels(min_disparity: Any, max_disparity: Any) -> Levels:
-    """Return the levels ``min_disparity <= d < max_disparity``; raise OptionError if there are none or too many."""
-    low = check_integer("min_disparity", min_disparity, -MAX_DISPARITY, MAX_DISPARITY)
-    high = check_integer("max_disparity", max_disparity, low + 1)
-    if high - low > _MAX_LEVELS:
-        raise OptionError(f"max_disparity - min_disparity must be at most {_MAX_LEVELS}, got {high - low}")
-    return Levels(low, high - low)
-
-
-def build_cost(name: Any, options: dict[str, Any]) -> Any:
-    """Return the cost called `name` with `options`; raise OptionError for those that it does not have.
-
-    A cost that is given itself is returned as it is.
-    """
-    if hasattr(name, "prepare") and not isinstance(name, type) and not options:
-        return name
-    return _build("cost", COSTS.get(name), options)
-
-
-def build_aggregation(name: str, options: dict[str, Any]) -> Any:
-    """Return the aggregation called `name` with `options`; raise OptionError for those that it does not have."""
-    return _build("aggregation", AGGREGATIONS.get(name), options)
-
-
-def _build(kind: str, factory: Any, options: dict[str, Any]) -> Any:
-    check_names(f"option of this {kind}", options, _option_names(factory))
-    return factory(**options)
-
-
-def _option_names(factory: Any) -> list[str]:
-    return [f.name for f in fields(factory) if f.init] if isinstance(factory, type) else []
 
 
 class Matcher:
@@ -189,7 +130,7 @@ class Matcher:
     def _set_stages(self, options: dict[str, Any]) -> None:
         cost_name, aggregation_name = self.method.split("+")
         cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
-        cost_options, aggregation_options = _option_names(cost), _option_names(aggregation)
+        cost_options, aggregation_options = option_names(cost), option_names(aggregation)
         check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options}))
         merged = {**DEFAULTS[""], **DEFAULTS.get(self.method, {}), **options}
         self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})

@@ -17,7 +17,7 @@ from stereokit.inputs import check_integer, check_number, gray_pair, writable
 from stereokit.inputs import smooth as smoothed
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.workspace import Workspace
-from stereokit.matching import build_aggregation, build_cost, check_levels
+from stereokit.methods import build_aggregation, build_cost, check_levels
 from stereokit.selection.wta import winners_like
 
 __all__ = ["aggregate", "cost_volume"]

@@ -22,7 +22,7 @@ import numpy as np
 
 from stereokit import Matcher
 from stereokit.defaults import METHODS
-from stereokit.matching import parse_method
+from stereokit.methods import parse_method
 from stereokit_evaluation.datasets import Frame, kitti2015, middlebury, select
 from stereokit_evaluation.runner import run
 

@@ -30,7 +30,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
 from stereokit.io import check_output, read_image, write_bytes
-from stereokit.matching import parse_method
+from stereokit.methods import parse_method
 from stereokit_evaluation._peers import PEERS, Call, label, make, peers
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._rounds import round_robin

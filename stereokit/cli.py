@@ -43,7 +43,7 @@ _OWN_OPTIONS = frozenset(  # not through --set
     "method max_disparity min_disparity scale refiner fill threads device right confidence".split()
 )
 _STAGES = {
-    "census": "Census 9x7 cost",
+    "census": "Census cost",
     "zncc": "ZNCC cost",
     "sgm": "semi-global matching",
     "dt": "domain transform",
@@ -73,6 +73,8 @@ class _Commands(TyperGroup):
             if (error.name or "stereokit").startswith("stereokit"):
                 raise
             _fail(f"this needs the package {error.name!r}, which is not installed", error)
+        except MemoryError as error:
+            _fail(f"not enough memory: {error}" if str(error) else "not enough memory", error)
         except KeyboardInterrupt as error:  # typer 0.12 would end with 1
             raise typer.Exit(130) from error
 

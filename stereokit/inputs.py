@@ -95,10 +95,14 @@ def writable(array: Any) -> NDArray[Any]:
 
 def _checked(name: str, image: Any) -> NDArray[Any]:
     """Return an image of an accepted type and shape, (H, W) or (H, W, 3)."""
+    if isinstance(image, np.ma.MaskedArray):
+        raise InputError(f"{name} must be a plain array, got a masked one; put NaN where there is no evidence")
     try:
         array = np.asarray(image)
     except ValueError as error:
         raise InputError(f"{name} must be an array of numbers: {error}") from None
+    if array.dtype.byteorder not in "=|":
+        array = array.astype(array.dtype.newbyteorder("="))
     if array.dtype not in _TYPES:
         raise InputError(f"{name} must be uint8, uint16, float32 or float64, got {array.dtype}")
     if array.ndim == 3 and array.shape[2] == 1:

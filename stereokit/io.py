@@ -230,7 +230,7 @@ def write_disparity(path: str | os.PathLike[str], disparity: ArrayLike) -> None:
     Raises
     ------
     InputError
-        If `disparity` is not a 2-d array of floats.
+        If `disparity` is not a 2-d array of floats, or is negative somewhere and the file is a ``.png``.
     FileError
         If the suffix is unknown or the file cannot be written.
     """
@@ -238,6 +238,9 @@ def write_disparity(path: str | os.PathLike[str], disparity: ArrayLike) -> None:
     values = _checked_map(disparity)
     known = np.isfinite(values)
     if suffix == ".png":
+        if known.any() and values[known].min() < 0:
+            lowest = values[known].min()
+            raise InputError(f"disparity must not be negative for KITTI's .png (use .pfm, .npy), got {lowest:g}")
         steps = np.where(known, values, np.float32(0)) * np.float32(256)
         data = _encode(".png", np.where(known, np.clip(np.rint(steps), 1, 65535), 0).astype(np.uint16))
     elif suffix == ".pfm":

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Levels, Pair
 from stereokit.defaults import DEFAULTS, METHODS
-from stereokit.errors import OptionError, UnknownNameError, did_you_mean
+from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import (
     GrayPair,
     check_flag,
@@ -118,7 +118,7 @@ class Matcher:
         if device == "cuda":
             raise OptionError("device 'cuda' is not available in this version; use 'cpu' or 'auto'")
         self.device = "cpu"
-        self.threads = available_threads() if threads is None else check_integer("threads", threads, 1)
+        self.threads = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
         if refiner is not None and self.scale == 1:
             raise OptionError(f"refiner needs scale=0.5, got refiner={refiner!r} with scale=1")
         name = "linear" if refiner is None else refiner
@@ -154,6 +154,13 @@ class Matcher:
         self.subpixel = check_flag("subpixel", merged["subpixel"])
         self.confidence = check_flag("confidence", merged["confidence"])
         self.right = check_flag("right", merged["right"])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_pool"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._pool = Pool()
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
@@ -210,11 +217,23 @@ class Matcher:
         source = iter(pairs)
         with ThreadPoolExecutor(self.threads, thread_name_prefix="stereokit-map") as executor:
             try:
+                failure: BaseException | None = None  # of the source: what it gave before is still matched
                 for done in itertools.count(1):
-                    for left, right in itertools.islice(source, 2 * self.threads - len(ahead)):
-                        ahead.append(executor.submit(self._call, left, right, 1))
+                    while failure is None and len(ahead) < 2 * self.threads:
+                        try:
+                            pair = next(source)
+                            left, right = pair
+                        except (TypeError, ValueError):
+                            failure = InputError("pairs must give (left, right) each time")
+                        except BaseException as error:
+                            failure = error
+                        else:
+                            ahead.append(executor.submit(self._call, left, right, 1))
                     if not ahead:
-                        return
+                        if isinstance(failure, StopIteration):
+                            return
+                        assert failure is not None
+                        raise failure
                     yield ahead.popleft().result()
                     if progress is not None:
                         progress(done)
@@ -341,7 +360,9 @@ def warmup(*methods: str, max_disparity: int = 128) -> None:
 
 
 def _forget_matchers() -> None:
+    global _matchers_lock
     _matchers.clear()
+    _matchers_lock = threading.Lock()  # the old one may be held by a thread that the child does not have
 
 
 if hasattr(os, "register_at_fork"):  # buffers of a call that was under way stay with the parent

@@ -1,7 +1,9 @@
 """The stages on whole volumes, for those who reuse the parts.
 
-``select(aggregate(cost_volume(left, right), guide))`` gives what `stereokit.Matcher` gives before post-processing,
-bit for bit: the same compiled code runs over rows of a stored volume instead of rows made on the way.
+With the same options, ``select(aggregate(cost_volume(left, right), guide))`` gives what `stereokit.Matcher` gives
+before post-processing, bit for bit: the same compiled code runs over rows of a stored volume instead of rows made on
+the way. The stages do not know of methods, so they have their own plain defaults; those of a method are in
+`stereokit.defaults` (window, penalties, ``smooth`` and ``outside``).
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ def cost_volume(
     """
     stage: Cost = build_cost(cost, options)
     levels = check_levels(min_disparity, max_disparity)
-    count = available_threads() if threads is None else check_integer("threads", threads, 1)
+    count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
     share = None if outside is None else check_number("outside", outside, 0, 1)
     gray = smoothed(gray_pair(left, right), check_number("smooth", smooth, 0, 10))
     pair = Pair(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
@@ -108,7 +110,7 @@ def aggregate(
     guide = writable(guide)
     if guide.dtype != np.uint8 or guide.shape != volume.shape[:2]:
         raise InputError(f"guide must be uint8 {volume.shape[:2]}, got {guide.dtype} {guide.shape}")
-    count = available_threads() if threads is None else check_integer("threads", threads, 1)
+    count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
     if not floats and int(volume.max()) > maker.cost_max:
         raise OptionError(f"cost {maker.name!r} has costs up to {maker.cost_max}, but the volume has {volume.max()}")
     height, width, depth = volume.shape

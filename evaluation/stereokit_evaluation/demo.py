@@ -169,6 +169,7 @@ def demo(
         scored = score(found.disparity, noc=scene.noc, occ=scene.occ, objects=scene.objects, measured=found.valid)
         label = f"{short[name]} {name}" if name in short else name
         outcomes.append(_Outcome(name, label, str(matcher.device), found.disparity, scored, statistics.median(times)))
+    _make_folder(output)
     _write_pictures(output, scene, outcomes)
     document = {"results": [_as_json(outcome) for outcome in outcomes]}
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
@@ -189,9 +190,15 @@ def _parse_size(size: str) -> tuple[int, int]:
 
 
 def _check_places(output: Path, json_file: Path | None) -> None:
-    """Refuse what cannot be written before any work is done, and make the folder."""
+    """Refuse what cannot be written before any work is done."""
     if json_file is not None and str(json_file) != "-" and (json_file.is_dir() or not json_file.parent.is_dir()):
         raise FileError(f"json must name a file in an existing folder, got {str(json_file)!r}")
+    nearest = next(place for place in (output, *output.absolute().parents) if place.exists())
+    if not nearest.is_dir():
+        raise FileError(f"output must be a folder, got {str(output)!r} ({str(nearest)!r} is a file)")
+
+
+def _make_folder(output: Path) -> None:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -173,6 +173,8 @@ def parse_threads(text: str) -> list[int]:
 
 def _read(path: Path) -> Gray:
     image = read_image(path, gray=True)
+    if image.dtype.kind == "f":
+        raise InputError(f"images to time must be 8 or 16 bit, got {image.dtype} in {str(path)!r}")
     return (image // 257).astype(np.uint8) if image.dtype == np.uint16 else image
 
 

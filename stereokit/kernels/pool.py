@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 __all__ = ["available_threads", "run", "spans"]
 
@@ -34,8 +34,9 @@ def _shared_executor() -> ThreadPoolExecutor:
 
 
 def _forget_executor() -> None:
-    global _executor
+    global _executor, _lock
     _executor = None
+    _lock = threading.Lock()  # the old one may be held by a thread that the child does not have
 
 
 if hasattr(os, "register_at_fork"):  # a forked child has no worker threads: it must start its own
@@ -45,6 +46,19 @@ if hasattr(os, "register_at_fork"):  # a forked child has no worker threads: it 
 def _run_all(tasks: Sequence[Callable[[], object]]) -> None:
     for task in tasks:
         task()
+
+
+def _wait_for(others: list[Future[None]]) -> None:
+    """Wait until all have ended, however often the user interrupts: until then they write to borrowed buffers."""
+    interrupted: KeyboardInterrupt | None = None
+    while True:
+        try:
+            wait(others)
+            break
+        except KeyboardInterrupt as error:
+            interrupted = error
+    if interrupted is not None:
+        raise interrupted
 
 
 def run(tasks: Sequence[Callable[[], object]], threads: int) -> None:
@@ -62,7 +76,7 @@ def run(tasks: Sequence[Callable[[], object]], threads: int) -> None:
     try:
         _run_all(tasks[0::count])
     finally:
-        wait(others)
+        _wait_for(others)
     for other in others:
         other.result()
 

@@ -6,7 +6,7 @@ several threads never share a buffer and a steady stream of equal frames allocat
 
 from __future__ import annotations
 
-import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -44,16 +44,16 @@ class Pool:
     """Workspaces of one matcher: as many as there were calls at the same time."""
 
     def __init__(self) -> None:
-        self._free: list[Workspace] = []
-        self._lock = threading.Lock()
+        self._free: deque[Workspace] = deque()  # its pop and append need no lock, which a fork could leave held
 
     @contextmanager
     def take(self) -> Iterator[Workspace]:
         """Lend a workspace for the length of a ``with`` block."""
-        with self._lock:
-            workspace = self._free.pop() if self._free else Workspace()
+        try:
+            workspace = self._free.pop()
+        except IndexError:
+            workspace = Workspace()
         try:
             yield workspace
         finally:
-            with self._lock:
-                self._free.append(workspace)
+            self._free.append(workspace)

@@ -304,7 +304,7 @@ def test_list(tmp_path):
     content = json.loads((tmp_path / "list.json").read_text())
     assert content["methods"]["S2"] == {
         "method": "census+sgm",
-        "description": "Census 9x7 cost + semi-global matching",
+        "description": "Census cost + semi-global matching",
     }
     assert {"costs", "aggregations", "refiners"} <= content.keys()
 

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+import signal
+import textwrap
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 import stereokit
-from stereokit import Matcher, match
+from stereokit import InputError, Matcher, match
+from stereokit.kernels import pool
 
 METHODS = list(stereokit.METHODS.values())
 
@@ -141,3 +148,57 @@ def test_a_forked_child_can_match(run_python, tmp_path):
         "        assert pool.map_async(work, range(4)).get(timeout=60) == [first] * 4\n"
     )
     run_python(script, timeout=120)
+
+
+def test_a_fork_while_locks_are_held_leaves_a_child_that_can_match(run_python):
+    """A child has none of its parent's threads, so a lock that one of them holds must not be inherited."""
+    code = """
+        import os
+        import numpy as np
+        from stereokit import match, matching
+        from stereokit.kernels import pool
+        image = np.arange(400, dtype=np.uint8).reshape(10, 40)
+        expected = match(image, image, "S2", max_disparity=4, threads=2)
+        with matching._matchers_lock, pool._lock:
+            child = os.fork()
+            if child == 0:
+                same = np.array_equal(match(image, image, "S2", max_disparity=4, threads=2), expected)
+                os._exit(0 if same else 1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        print("matched")
+        """
+    assert "matched" in run_python("-c", textwrap.dedent(code))
+
+
+def test_a_matcher_can_be_pickled_and_copied(random_pair):
+    left, right = random_pair(9, 40, seed=5)
+    matcher = Matcher("census+sgm", max_disparity=16)
+    expected = matcher(left, right).disparity
+    for other in (pickle.loads(pickle.dumps(matcher)), copy.deepcopy(matcher)):
+        np.testing.assert_array_equal(other(left, right).disparity, expected)
+
+
+def test_workers_are_waited_for_after_an_interrupt():
+    """Until all tasks have ended their buffers are in use: an interrupt must not hand them to the next call."""
+    ended = []
+
+    def slow():
+        time.sleep(0.5)
+        ended.append(True)
+
+    timer = threading.Timer(0.1, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        pool.run([lambda: None, slow], 2)
+    assert ended == [True]
+
+
+def test_map_gives_what_it_has_before_a_broken_source(random_pair):
+    pair = random_pair(9, 40, seed=6)
+    matcher = Matcher("census+sgm", max_disparity=16, threads=2)
+    for broken in [(pair[0],), (*pair, pair[0]), None]:
+        results = []
+        with pytest.raises(InputError, match="pairs must give"):
+            for result in matcher.map([pair, pair, pair, broken, pair]):
+                results.append(result)
+        assert len(results) == 3

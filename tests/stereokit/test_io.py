@@ -133,11 +133,17 @@ def test_kitti_png_is_read_as_the_devkit_says(tmp_path):
 
 
 def test_kitti_png_is_written_as_the_devkit_says(tmp_path):
-    disparity = np.array([[NAN, INF, 0, -3, 1e-6, 1.5, 255.99, 256, 1e6, 2 + 0.6 / 256]], np.float32)
+    disparity = np.array([[NAN, INF, 0, 1e-6, 1.5, 255.99, 256, 1e6, 2 + 0.6 / 256]], np.float32)
     io.write_disparity(tmp_path / "d.png", disparity)
     stored = cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
     assert stored.dtype == np.uint16
-    assert stored.tolist() == [[0, 0, 1, 1, 1, 384, 65533, 65535, 65535, 513]]
+    assert stored.tolist() == [[0, 0, 1, 1, 384, 65533, 65535, 65535, 513]]
+
+
+def test_kitti_png_holds_no_negative_disparity(tmp_path):
+    with pytest.raises(InputError, match=r"disparity must not be negative .* got -0.25"):
+        io.write_disparity(tmp_path / "d.png", np.array([[1, -0.25, NAN]], np.float32))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("kind", ["eight", "color"])

@@ -274,7 +274,7 @@ BAD_OPTIONS = [
     ({"scale": None}, ["scale", "None"]),
     ({"scale": "half"}, ["scale", "half"]),
     ({"device": "tpu"}, ["device", "cpu", "tpu"]),
-    ({"threads": 0}, ["threads", "at least 1", "0"]),
+    ({"threads": 0}, ["threads", "from 1", "0"]),
     ({"threads": -1}, ["threads", "-1"]),
     ({"threads": 1.5}, ["threads", "1.5"]),
     ({"refiner": "linear"}, ["refiner", "scale=0.5"]),

@@ -24,6 +24,7 @@ __all__ = [
     "check_names",
     "check_number",
     "gray_pair",
+    "guide_of",
     "half_size",
     "smooth",
 ]
@@ -199,10 +200,11 @@ def gray_pair(left: Any, right: Any) -> GrayPair:
     if a.dtype == np.uint16 and max(int(a.max()), int(b.max())) <= 255:
         a, b = a.astype(np.uint8), b.astype(np.uint8)
     a, b = writable(a), writable(b)
-    return GrayPair(a, b, bad[0], bad[1], _guide(a, b))
+    return GrayPair(a, b, bad[0], bad[1], guide_of(a, b))
 
 
-def _guide(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint8]:
+def guide_of(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return `left`, (H, W) uint8 or uint16, in 256 grey levels of the range that it shares with `right`."""
     if left.dtype == np.uint8:
         return left
     low = min(int(left.min()), int(right.min()))

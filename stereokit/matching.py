@@ -27,6 +27,7 @@ from stereokit.inputs import (
     check_names,
     check_number,
     gray_pair,
+    guide_of,
     half_size,
     smooth,
 )
@@ -301,8 +302,7 @@ def _mirror(pair: GrayPair) -> GrayPair:
 
     left, right = flip(pair.right), flip(pair.left)
     assert left is not None and right is not None
-    swapped = gray_pair(left, right)
-    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), swapped.guide)
+    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right))
 
 
 _matchers: dict[Any, Matcher] = {}

@@ -54,9 +54,7 @@ def compose(
         corrected = np.empty(coarse.shape, np.float32)
         run([partial(_correct, head, coarse, y0, y1, corrected) for y0, y1 in spans(len(coarse), threads)], threads)
         held = [np.empty(4 * len(OFFSETS), np.float32) for _ in parts]
-        tasks = [
-            partial(_mix, head, corrected, _DY, _DX, y0, y1, held[k], out) for k, (y0, y1) in enumerate(parts)
-        ]
+        tasks = [partial(_mix, head, corrected, _DY, _DX, y0, y1, held[k], out) for k, (y0, y1) in enumerate(parts)]
     else:
         tasks = [partial(_correct_upscaled, head, coarse, y0, y1, out) for y0, y1 in parts]
     run(tasks, threads)

@@ -118,9 +118,7 @@ def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
     inputs: dict[str, list[Any]] = {"coarse": [1, 1, "h", "w"], "left": [1, 1, "2h", "2w"]}
     coarse = ops.multiply("coarse", 2)
     gray = ops.multiply("left", 1 / 255) if literal else ops.shift(ops.multiply("left", 4 / 255), -1.6)
-    encoded = {
-        "disparity": ops.multiply(coarse, 1 / 256) if literal else ops.shift(ops.multiply(coarse, 1 / 16), -1.5)
-    }
+    encoded = {"disparity": ops.multiply(coarse, 1 / 256) if literal else ops.shift(ops.multiply(coarse, 1 / 16), -1.5)}
     if "image" in network.inputs:
         encoded["image"] = ops.node("AveragePool", [gray], kernel_shape=[2, 2], strides=[2, 2])
     if "phases" in network.inputs:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -153,7 +152,9 @@ def compose(name: str, form: str, head: Tensor, coarse: Tensor) -> Tensor:
     if form == "literal":
         return F.pixel_shuffle(head, 2) * 256
     if name != "stereokit":
-        return F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + 4 * F.pixel_shuffle(head, 2)
+        return F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + 4 * F.pixel_shuffle(
+            head, 2
+        )
     rows, columns = head.shape[-2:]
     count = len(OFFSETS)
     reach = max(max(abs(dy), abs(dx)) for dy, dx in OFFSETS)

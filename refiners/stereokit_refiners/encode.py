@@ -28,10 +28,11 @@ def check_form(form: str) -> str:
     return form
 
 
-def half_image(left: NDArray[Any]) -> NDArray[Any]:
-    """Return the mean of each 2x2 pixels of an image with even sides, (2h, 2w) -> (h, w), of the same type."""
+def half_image(left: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the mean of each 2x2 pixels of an image with even sides, (2h, 2w) -> (h, w) float32."""
     size = (left.shape[1] // 2, left.shape[0] // 2)
-    return np.asarray(cv2.resize(left, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0])
+    halved = cv2.resize(left.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(halved, np.float32).reshape(size[1], size[0])
 
 
 def encode(
@@ -59,7 +60,7 @@ def encode(
 
     def gray(image: NDArray[Any]) -> NDArray[np.float32]:
         values = image.astype(np.float32) * np.float32(1 / 255)
-        return values if literal else (values - np.float32(0.4)) * np.float32(4)
+        return values if literal else np.asarray((values - np.float32(0.4)) * np.float32(4), np.float32)
 
     makers: dict[str, Callable[[], NDArray[np.float32]]] = {
         "disparity": lambda: (

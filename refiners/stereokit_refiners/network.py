@@ -25,7 +25,7 @@ from stereokit_refiners._compose import compose
 from stereokit_refiners.encode import encode
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
 
-__all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner", "from_file"]
+__all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner"]
 
 BACKENDS = ("openvino", "onnxruntime", "torch")
 PRECISIONS = ("fp32", "bf16", "int8")
@@ -66,9 +66,24 @@ class LearnedRefiner:
     _compiled: _Compiled = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        content = shipped(self.architecture) if self.weights is None else read(self.weights)
+        if self.weights is None and not self.architecture:
+            raise OptionError("refiner 'file' needs weights, the path of a .safetensors file, got none")
+        self._use(shipped(self.architecture) if self.weights is None else read(self.weights))
+
+    @classmethod
+    def of(cls, content: WeightFile, *, backend: str = "auto", precision: str = "auto") -> LearnedRefiner:
+        """Return a refiner of weights that are in memory."""
+        made = object.__new__(cls)
+        for name, value in (("weights", None), ("backend", backend), ("precision", precision)):
+            object.__setattr__(made, name, value)
+        made._use(content)
+        return made
+
+    def _use(self, content: WeightFile) -> None:
         if self.architecture and content.network != self.architecture:
-            raise OptionError(f"weights of refiner {self.architecture!r} must be its own, got those of {content.network!r}")
+            raise OptionError(
+                f"weights of refiner {self.architecture!r} must be its own, got those of {content.network!r}"
+            )
         object.__setattr__(self, "_file", content)
         object.__setattr__(self, "backend", _backend(self.backend))
         object.__setattr__(self, "precision", _precision(self.precision, self.backend, content))
@@ -134,14 +149,9 @@ class CnnRefiner(LearnedRefiner):
 
 @dataclass(frozen=True)
 class PyramidRefiner(LearnedRefiner):
-    """This project's own network: see `stereokit_refiners.pyramid`."""
+    """The network of this project: see `stereokit_refiners.pyramid`."""
 
     architecture: ClassVar[str] = "stereokit"
-
-
-def from_file(path: str) -> LearnedRefiner:
-    """Return the refiner of a weight file, whatever its architecture."""
-    return LearnedRefiner(weights=path)
 
 
 def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:

@@ -9,8 +9,8 @@ cache folder under a name that says all of that, and the same on every machine. 
 from __future__ import annotations
 
 import hashlib
+import io
 import os
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stereokit
+from stereokit.defaults import DEFAULTS
 from stereokit.io import write_bytes
+from stereokit.kernels.jit import FINGERPRINT
+from stereokit.methods import parse_method
 
 __all__ = ["Crop", "Pair", "Sample", "crop", "load_variant", "make_variant", "whole"]
 
@@ -243,9 +246,7 @@ def _photographed(
 
 def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
     """Return the matcher's options, drawn around the defaults of `stereokit.defaults`."""
-    from stereokit.defaults import DEFAULTS
-
-    name = stereokit.matching.parse_method(method)
+    name = parse_method(method)
     base = {**DEFAULTS[""], **DEFAULTS.get(name, {})}
     options: dict[str, Any] = {
         "smooth": float(np.clip(base["smooth"] * np.exp(rng.normal(0, 0.15)), 0.3, 1.2)),
@@ -255,17 +256,17 @@ def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
     if "p1" in base:
         scale = float(np.exp(rng.normal(0, 0.2)))
         options["p1"] = base["p1"] * scale
-        options["p2"] = float(np.clip(base["p2"] * scale * np.exp(rng.normal(0, 0.2)), base["p1"] * scale, base["p2"] * 1.5))
+        options["p2"] = float(
+            np.clip(base["p2"] * scale * np.exp(rng.normal(0, 0.2)), base["p1"] * scale, base["p2"] * 1.5)
+        )
     return options
 
 
 def cache_name(pair: Pair, method: str, seed: int, number: int, max_disparity: int) -> str:
     """Return the file name of a variant: all that it depends on."""
-    from stereokit.kernels.jit import _FINGERPRINT
-
     own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
     which = f"{pair.digest}-{method.lower().replace('+', '_')}-{max_disparity}-{seed}-{number}"
-    return f"{which}-{_FINGERPRINT}-{own}.npz"
+    return f"{which}-{FINGERPRINT}-{own}.npz"
 
 
 def load_variant(
@@ -280,10 +281,8 @@ def load_variant(
             )
     sample = make_variant(pair, method, seed, number, max_disparity)
     if path is not None:
-        import io
-
         buffer = io.BytesIO()
-        np.savez(buffer, **{k: np.asarray(v) for k, v in vars(sample).items()})
+        np.savez(buffer, allow_pickle=False, **{k: np.asarray(v) for k, v in vars(sample).items()})
         os.makedirs(path.parent, exist_ok=True)
         write_bytes(path, buffer.getvalue())
     return sample

@@ -25,13 +25,13 @@ from torch import Tensor
 
 from stereokit.errors import OptionError
 from stereokit.io import write_bytes
-from stereokit_refiners._torch import Module, compose
+from stereokit_refiners._torch import Module, calibrate, compose
 from stereokit_refiners.encode import check_form, encode
 from stereokit_refiners.layers import Network, Weights
 from stereokit_refiners.losses import LOSSES, distance, divergence
 from stereokit_refiners.samples import Crop, Sample, crop, whole
 
-__all__ = ["PRESETS", "History", "Settings", "Source", "bad_pixels", "fit", "predict"]
+__all__ = ["PRESETS", "History", "Settings", "Source", "bad_pixels", "calibrated", "fit", "predict", "restored"]
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,10 @@ def _batch(network: Network, form: str, crops: Sequence[Crop]) -> dict[str, Tens
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
 
-def _draw(network: Network, sources: Sequence[Source], settings: Settings, step: int) -> dict[str, Tensor]:
-    rng = np.random.default_rng([settings.seed, step])
+def _draw(
+    network: Network, sources: Sequence[Source], settings: Settings, step: int, rank: int = 0
+) -> dict[str, Tensor]:
+    rng = np.random.default_rng([settings.seed, step, rank])
     shares = np.array([source.weight for source in sources])
     crops = []
     for _ in range(settings.batch):
@@ -178,7 +180,7 @@ def _draw(network: Network, sources: Sequence[Source], settings: Settings, step:
 
 
 def _batches(
-    network: Network, sources: Sequence[Source], settings: Settings, first: int
+    network: Network, sources: Sequence[Source], settings: Settings, first: int, rank: int
 ) -> Iterator[tuple[int, dict[str, Tensor]]]:
     """Yield the batches from step `first` on, two ahead of their use."""
     with ThreadPoolExecutor(1) as executor:
@@ -186,7 +188,7 @@ def _batches(
         upcoming = iter(range(first, settings.steps))
         while True:
             for step in upcoming:
-                ahead.append((step, executor.submit(_draw, network, sources, settings, step)))
+                ahead.append((step, executor.submit(_draw, network, sources, settings, step, rank)))
                 if len(ahead) > 2:
                     break
             if not ahead:
@@ -202,7 +204,9 @@ def _rate(settings: Settings, step: int) -> float:
     return settings.learning_rate * warm * (0.5 * (1 + float(np.cos(np.pi * step / settings.steps))) + 0.005)
 
 
-def _loss(settings: Settings, network: Network, heads: dict[str, Tensor], batch: dict[str, Tensor], step: int) -> Tensor:
+def _loss(
+    settings: Settings, network: Network, heads: dict[str, Tensor], batch: dict[str, Tensor], step: int
+) -> Tensor:
     estimate = compose(network.name, settings.form, heads["map"], batch["coarse"])
     kind = settings.finish if settings.finish and 3 * step >= 2 * settings.steps else settings.loss
     pixels = distance(kind, estimate - batch["truth"], batch["truth"]) * batch["weight"]
@@ -256,7 +260,7 @@ def _score(module: Module, settings: Settings, samples: Sequence[Sample]) -> flo
 def fit(
     network: Network, sources: Sequence[Source], validation: Sequence[Sample], settings: Settings, *,
     start: Weights | None = None, checkpoint: Path | None = None, save_every_s: float = 60.0,
-    progress: Callable[[int, float, float | None], object] | None = None,
+    progress: Callable[[int, float, float | None], object] | None = None, rank: int = 0, world: int = 1,
 ) -> tuple[dict[str, NDArray[np.float32]], History]:  # fmt: skip
     """Train a network.
 
@@ -275,6 +279,9 @@ def fit(
         Seconds between checkpoints.
     progress : callable, optional
         Called with the step, the training loss and the last score after each step.
+    rank, world : int
+        This process and how many there are, when torch.distributed was set up (``torchrun``): each draws crops of
+        its own and the gradients are averaged; the first one writes.
 
     Returns
     -------
@@ -301,16 +308,18 @@ def fit(
     if checkpoint is not None and checkpoint.exists():
         state = torch.load(checkpoint, map_location=device, weights_only=True)
         if state["settings"] != _described(network, settings):
-            raise OptionError(f"checkpoint {str(checkpoint)!r} is of other settings; remove it or choose another folder")
+            raise OptionError(
+                f"checkpoint {str(checkpoint)!r} is of other settings; remove it or choose another folder"
+            )
         module.load_state_dict(state["module"])
         average.load_state_dict(state["average"])
         optimizer.load_state_dict(state["optimizer"])
-        history.rows = [tuple(row) for row in state["history"]]  # type: ignore[misc]
+        history.rows = [tuple(row) for row in state["history"]]
         first, best, misses = state["step"], state["best"], state["misses"]
         best_arrays = {k: v.numpy() for k, v in state["best_arrays"].items()} or None
 
     def save(step: int) -> None:
-        if checkpoint is None:
+        if checkpoint is None or rank > 0:
             return
         buffer = io.BytesIO()
         torch.save(
@@ -327,8 +336,8 @@ def fit(
 
     module.train()
     saved, losses, score = time.monotonic(), [], None
-    for step, drawn in _batches(network, sources, settings, first):
-        torch.manual_seed(settings.seed * 1_000_003 + step)
+    for step, drawn in _batches(network, sources, settings, first, rank):
+        torch.manual_seed((settings.seed * 1_000_003 + step) * world + rank)
         batch = {name: tensor.to(device, non_blocking=True) for name, tensor in drawn.items()}
         for group in optimizer.param_groups:
             group["lr"] = _rate(settings, step)
@@ -337,7 +346,12 @@ def fit(
             heads = module(inputs)
         loss = _loss(settings, network, heads, batch, step)
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
+        if world > 1:
+            for parameter in module.parameters():
+                assert parameter.grad is not None
+                torch.distributed.all_reduce(parameter.grad)
+                parameter.grad.div_(world)
         if settings.clip > 0:
             torch.nn.utils.clip_grad_norm_(module.parameters(), settings.clip)
         optimizer.step()
@@ -363,6 +377,23 @@ def fit(
         if settings.patience > 0 and misses >= settings.patience:
             break
     return best_arrays or average.arrays(), history
+
+
+def restored(network: Network, arrays: Weights) -> Module:
+    """Return a module with the weights of a file."""
+    module = Module(network)
+    module.load(arrays)
+    return module.eval()
+
+
+def calibrated(module: Module, form: str, sources: Sequence[Source], count: int = 24) -> dict[str, float]:
+    """Return the ranges of the activations for int8, over whole samples taken evenly from `sources`."""
+    batches = []
+    for source in sources:
+        step = max(1, len(source.samples) * len(sources) // count)
+        for sample in source.samples[::step]:
+            batches.append(_batch(module.network, form, [whole(sample, module.network.multiple)]))
+    return calibrate(module, ({name: b[name] for name in module.network.inputs} for b in batches))
 
 
 def _described(network: Network, settings: Settings) -> dict[str, Any]:

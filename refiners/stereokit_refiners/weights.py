@@ -122,7 +122,7 @@ def read(path: str | Path) -> WeightFile:
     try:
         with library.safe_open(text, framework="np") as held:
             metadata = held.metadata() or {}
-            arrays = {name: held.get_tensor(name) for name in held.keys()}  # noqa: SIM118  (not a mapping)
+            arrays = {name: held.get_tensor(name) for name in held.keys()}
     except Exception as error:  # the library raises its own types
         raise FileError(f"weights must be a safetensors file, got {text!r} ({' '.join(str(error).split())})") from None
     if metadata.get("format") != _FORMAT:

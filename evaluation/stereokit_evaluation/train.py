@@ -42,6 +42,9 @@ def train(
     frames: Annotated[str | None, typer.Option(help="Frames to train on, such as 13-33,46.")] = None,
     validation: Annotated[str | None, typer.Option(help="Frames to look at on the way.")] = None,
     folds: Annotated[str | None, typer.Option(help="Groups to hold out in turn: 0-3/13-17/18-33.")] = None,
+    extra: Annotated[
+        list[str] | None, typer.Option(metavar="DATASET:ROOT", help="More frames to train on, never held out.")
+    ] = None,
     streets: Annotated[int, typer.Option(help="Synthetic streets to train on.")] = 0,
     street_share: Annotated[float, typer.Option(help="Share of the crops that are of streets.")] = 0.5,
     method: Annotated[list[str] | None, typer.Option(help="Matchers; may repeat. Default S1 to S4.")] = None,
@@ -62,8 +65,8 @@ def train(
     chosen = _settings(preset, settings or ())
     if refiner not in NETWORKS:
         raise OptionError(f"refiner to train must be one of {', '.join(NETWORKS)}, got {refiner!r}")
-    if dataset is None and streets < 1:
-        raise OptionError("dataset or streets must be given, got neither")
+    if dataset is None and streets < 1 and not extra:
+        raise OptionError("dataset, extra or streets must be given, got none of them")
     if folds is not None and (dataset is None or validation is not None):
         raise OptionError(f"folds must come with a dataset and without validation, got {folds!r}")
     if not 0 <= street_share <= 1 or streets < 0 or variants < 1:
@@ -79,6 +82,7 @@ def train(
     methods = list(method or _MATCHERS)
     everything = [] if dataset is None else list(load(dataset, root))
     groups = _groups(everything, frames, validation, folds)
+    more = _extra(extra or ())
     world = _join_group(torch)
 
     def samples(which: Sequence[Frame], numbers: range, step: Callable[..., None]) -> list[Any]:
@@ -105,7 +109,7 @@ def train(
                 step(pair.name)
         return found
 
-    trained = {frame.name: frame for training, _ in groups for frame in training}
+    trained = {frame.name: frame for training, _ in groups for frame in training} | more
     tested = {frame.name: frame for _, held_out in groups for frame in held_out}
     total = (len(trained) * variants + len(tested)) * len(methods) + 2 * streets
     with progress(total) as (_, step):
@@ -115,7 +119,8 @@ def train(
     results = []
     for number, (training, held_out) in enumerate(groups):
         sources = [Source(scenes, street_share if training else 1.0)] if scenes else []
-        mine = [sample for frame in training for sample in maps[frame.name]]
+        names = [*(frame.name for frame in training), *more]
+        mine = [sample for name in names for sample in maps[name]]
         if mine:
             sources.append(Source(mine, 1 - street_share if scenes else 1.0))
         folder = output if folds is None else output / f"fold-{number}"
@@ -171,6 +176,17 @@ def _groups(
         raise OptionError(f"folds must be two groups or more that share no frame, got {folds!r}")
     extra = [] if frames is None else [f for f in select(everything, frames) if f.name not in names]
     return [([*(f for other in parts if other is not part for f in other), *extra], part) for part in parts]
+
+
+def _extra(given: Sequence[str]) -> dict[str, Frame]:
+    """Return the frames of further data sets by names that clash with no other."""
+    frames = {}
+    for text in given:
+        dataset, colon, root = text.partition(":")
+        if not colon or not root:
+            raise OptionError(f"extra must be DATASET:ROOT, got {text!r}")
+        frames.update({f"{text}/{frame.name}": frame for frame in load(dataset, root)})
+    return frames
 
 
 def _folder(path: Path) -> None:

@@ -52,7 +52,7 @@ def test_demo_writes_pictures_table_and_figures(stand_in, tmp_path, capsys):
     demo(folder, seed=1, size="160x90", max_disparity=48, json_file=figures)
     refined = ["S4-half-stereovae", "S4-half-stereovae_error"]
     names = ["S1", "S1_error", "S4", *refined, "S4_error", "left", "overview", "right", "truth"]
-    assert sorted(path.name for path in folder.iterdir()) == [f"{name}.png" for name in names]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(f"{name}.png" for name in names)
     scene = module.generate(1, 160, 90, 48)
     for name, image in (("left", scene.left), ("right", scene.right)):
         np.testing.assert_array_equal(cv2.imread(str(folder / f"{name}.png"))[..., ::-1], image)

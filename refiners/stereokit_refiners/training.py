@@ -386,7 +386,7 @@ def restored(network: Network, arrays: Weights) -> Module:
     return module.eval()
 
 
-def calibrated(module: Module, form: str, sources: Sequence[Source], count: int = 24) -> dict[str, float]:
+def calibrated(module: Module, form: str, sources: Sequence[Source], count: int = 24) -> dict[str, list[float]]:
     """Return the ranges of the activations for int8, over whole samples taken evenly from `sources`."""
     batches = []
     for source in sources:

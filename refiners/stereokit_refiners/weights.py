@@ -42,8 +42,8 @@ class WeightFile:
         Architecture.
     form : {"residual", "literal"}
     arrays : dict of float32 arrays
-    ranges : dict of float
-        Largest absolute value of each activation, for int8; empty when it was not calibrated.
+    ranges : dict of lists of float
+        Largest absolute value of each channel of each activation, for int8; empty when it was not calibrated.
     notes : dict
         How it was trained: free, JSON.
     """
@@ -51,7 +51,7 @@ class WeightFile:
     network: str
     form: str
     arrays: Mapping[str, NDArray[np.float32]]
-    ranges: Mapping[str, float] = field(default_factory=dict)
+    ranges: Mapping[str, list[float]] = field(default_factory=dict)
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -100,7 +100,7 @@ def write(path: str | Path, content: WeightFile) -> None:
         "format": _FORMAT,
         "network": content.network,
         "form": content.form,
-        "ranges": json.dumps({name: float(bound) for name, bound in content.ranges.items()}, sort_keys=True),
+        "ranges": json.dumps(dict(content.ranges), sort_keys=True),
         "notes": json.dumps(content.notes, sort_keys=True),
     }
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in content.arrays.items()}
@@ -132,7 +132,7 @@ def read(path: str | Path) -> WeightFile:
         raise FileError(f"form of the weights must be one of {', '.join(FORMS)}, got {form!r} in {text!r}")
     _check(text, name, arrays)
     try:
-        ranges = {str(k): float(v) for k, v in json.loads(metadata.get("ranges", "{}")).items()}
+        ranges = {str(k): [float(x) for x in v] for k, v in json.loads(metadata.get("ranges", "{}")).items()}
         notes = dict(json.loads(metadata.get("notes", "{}")))
     except (ValueError, TypeError, AttributeError):
         raise FileError(f"weights must hold ranges and notes as JSON, got something else in {text!r}") from None

@@ -263,9 +263,7 @@ def test_first_weights_are_those_of_the_seed(name):
     torch = pytest.importorskip("torch")
     from stereokit_refiners._torch import Module
 
-    first, again, other = (
-        Module(NETWORKS[name], torch.Generator().manual_seed(seed)).arrays() for seed in (5, 5, 6)
-    )
+    first, again, other = (Module(NETWORKS[name], torch.Generator().manual_seed(seed)).arrays() for seed in (5, 5, 6))
     last = f"{NETWORKS[name].layers[-1].name}.weight"
     np.testing.assert_array_equal(first[last], again[last])
     assert (first[last] != other[last]).any()

@@ -41,7 +41,7 @@ class _OpenVinoOps:
         self.table = {layer.name: layer for layer in network.layers}
         self.weights = weights
         self.ranges = ranges
-        self.scales: dict[int, NDArray[np.float32]] = {}  # of the channels of nodes that hold 8 bits
+        self.scales: dict[int, tuple[Any, NDArray[np.float32]]] = {}  # of the channels of nodes that hold 8 bits
 
     def conv(self, name: str, inputs: Sequence[Any], *, activate: bool = True) -> Any:
         layer = self.table[name]
@@ -61,13 +61,13 @@ class _OpenVinoOps:
         return mean
 
     def add(self, a: Any, b: Any) -> Any:
-        return op.add(a, b)
+        return op.add(self._unscaled(a), self._unscaled(b))
 
     def shift(self, x: Any, by: float) -> Any:
-        return op.add(x, _const(by))
+        return op.add(self._unscaled(x), _const(by))
 
     def activate(self, name: str, x: Any) -> Any:
-        y = op.prelu(x, _const([0.1]))
+        y = op.prelu(self._unscaled(x), _const([0.1]))
         scale = self._scale(name)
         return y if scale is None else self._rounded(y, float(scale.max()), np.ones_like(scale))
 
@@ -75,7 +75,7 @@ class _OpenVinoOps:
         rows, columns = x.get_output_shape(0)[2:]
         sizes = op.constant(np.array([2 * rows, 2 * columns], np.int64))
         return op.interpolate(
-            x, sizes, "linear_onnx", "sizes", coordinate_transformation_mode="half_pixel",
+            self._unscaled(x), sizes, "linear_onnx", "sizes", coordinate_transformation_mode="half_pixel",
             axes=op.constant(np.array([2, 3], np.int64)),
         )  # fmt: skip
 
@@ -86,8 +86,14 @@ class _OpenVinoOps:
         """Hold `x` to 8 bits over -bound to bound; what it stands for is `scale` times that."""
         low, high = _const(-bound * 128 / 127), _const(bound)
         y = op.fake_quantize(x, low, high, low, high, 256)
-        self.scales[id(y)] = scale
+        self.scales[id(y)] = y, scale  # with the node, so that its id stays its own
         return y
+
+    def _unscaled(self, x: Any) -> Any:
+        """Return what `x` stands for."""
+        if id(x) not in self.scales or (self.scales[id(x)][1] == 1).all():
+            return x
+        return op.multiply(x, _const(self.scales[id(x)][1].reshape(1, -1, 1, 1)))
 
     def _convolve(self, layer: Layer, inputs: Sequence[Any], scale: NDArray[np.float32] | None) -> Any:
         """Convolve and divide the channels by `scale`.
@@ -102,7 +108,7 @@ class _OpenVinoOps:
             weight, bias = weight / factor[:, None, None, None], bias / factor
         ends = np.cumsum([x.get_output_shape(0)[1] for x in inputs])
         parts = [
-            part * self.scales[id(x)][None, :, None, None] if id(x) in self.scales else part
+            part * self.scales[id(x)][1][None, :, None, None] if id(x) in self.scales else part
             for x, part in zip(inputs, np.split(weight, ends[:-1], axis=1), strict=True)
         ]
         side = weight.shape[-1] // 2

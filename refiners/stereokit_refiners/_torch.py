@@ -59,8 +59,8 @@ class Module(nn.Module):
         return self.network.forward(_TorchOps(self), inputs)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return the weights under the names of weight files."""
-        return {_name(key): value.detach().float().cpu().numpy() for key, value in self.weights.items()}
+        """Return a copy of the weights under the names of weight files."""
+        return {_name(key): value.detach().float().cpu().numpy().copy() for key, value in self.weights.items()}
 
     def load(self, arrays: Mapping[str, NDArray[np.float32]]) -> None:
         """Take over the weights of a file."""

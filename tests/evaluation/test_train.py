@@ -320,7 +320,7 @@ def test_a_training_that_stops_early_writes_its_folder(root, tmp_path, trainable
         assert (tmp_path / "out" / f"fold-{k}" / "weights.safetensors").exists()
 
 
-@pytest.mark.parametrize("changed", [["--frames", "2-3"], ["--frames", "0-1", "--max-disparity", "64"]], ids=str)
+@pytest.mark.parametrize("changed", [["--frames", "2-3"]], ids=str)
 def test_a_folder_of_other_data_is_refused(root, tmp_path, trainable, changed):
     """Otherwise frames 2-3 are said to be trained on, and 0-1 not, by weights for which the contrary holds."""
     out = tmp_path / "out"

@@ -143,7 +143,7 @@ def test_calibration_covers_every_activation_but_the_linear_ones(name):
         assert max(bounds) > 0
 
 
-def test_calibration_is_the_largest_but_for_a_ten_thousandth_over_all_batches():
+def test_calibration_is_the_largest_but_for_a_thousandth_over_all_batches():
     torch = pytest.importorskip("torch")
     from stereokit_refiners._torch import Module, calibrate
 
@@ -156,7 +156,7 @@ def test_calibration_is_the_largest_but_for_a_ten_thousandth_over_all_batches():
     plane = torch.linspace(0, 1, 100 * 100).reshape(1, 1, 100, 100)
     batches = [{"disparity": plane * s, "image": torch.zeros_like(plane)} for s in (1.0, 3.0, 2.0)]
     ranges = calibrate(module, batches)
-    np.testing.assert_allclose(ranges["FE_1"], 3 * factors, rtol=1e-3)
+    np.testing.assert_allclose(ranges["FE_1"], 3 * factors, rtol=2e-3)
     assert ranges["FE_2"] == [0] * 32
     loose = calibrate(module, batches, share=0.5)
     np.testing.assert_allclose(loose["FE_1"], 1.5 * factors, rtol=2e-3)

@@ -439,7 +439,7 @@ def test_the_best_survives_a_stop(monkeypatch, tmp_path):
 
 def test_sources_without_samples_are_refused():
     for sources in ([], [Source([])], [Source(SAMPLES), Source([])]):
-        with pytest.raises(OptionError, match=r"^sources must hold at least one sample each$"):
+        with pytest.raises(OptionError, match=r"^sources must hold at least one sample each, got an empty one$"):
             fit(NETWORKS["cnn"], sources, [], settings())
 
 

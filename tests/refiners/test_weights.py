@@ -104,7 +104,7 @@ def test_loading_never_runs_code(tmp_path):
         ({"network": "resnet"}, ["no network named 'resnet'", "cnn, stereokit, stereovae"]),
         ({"network": ""}, ["no network named ''"]),
         ({"network": "stereovae"}, ["weights must be those of 'stereovae'", "lacks 'D_1.bias'"]),
-        ({"form": "printed"}, ["form of the weights must be one of residual, literal", "'printed'"]),
+        ({"form": "printed"}, ["must be one of residual, literal", "'printed'"]),
         ({"ranges": "not json"}, ["ranges and notes as JSON"]),
         ({"ranges": "[1, 2]"}, ["ranges and notes as JSON"]),
         ({"ranges": '{"FE_1": "wide"}'}, ["ranges and notes as JSON"]),

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
-from numba import types
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
@@ -31,6 +31,7 @@ __all__ = [
     "add",
     "add_saturated",
     "aligned",
+    "bits_of",
     "choose",
     "convert",
     "count_bits",
@@ -45,6 +46,7 @@ __all__ = [
     "minimum",
     "multiply",
     "multiply_high",
+    "multiply_pairs",
     "shift_down",
     "shift_left",
     "shift_right",
@@ -258,6 +260,56 @@ def convert(typing: Any, value: Any, like: Any) -> Any:
         return source
 
     return target(value, like), generate
+
+
+@intrinsic
+def bits_of(typing: Any, value: Any) -> Any:
+    """Return the bits of ``float32`` lanes as ``int32``."""
+    result = Vector(types.int32)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], result.llvm)
+
+    return result(value), generate
+
+
+@intrinsic
+def multiply_pairs(typing: Any, a: Any, b: Any) -> Any:
+    """Return ``low(a) * low(b) + high(a) * high(b)`` of ``int32`` lanes that hold two ``int16`` each, wrapping.
+
+    Processors of x86 have one instruction for it, of which LLVM must be told; others get the plain form.
+    """
+    if a != Vector(types.int32) or b != a:
+        return None
+    kind = a.llvm
+
+    def plain(builder: Any, x: Any, y: Any) -> Any:
+        half = ir.Constant(kind, [16] * LANES)
+        low = [builder.ashr(builder.shl(v, half), half) for v in (x, y)]
+        high = [builder.ashr(v, half) for v in (x, y)]
+        return builder.add(builder.mul(*low), builder.mul(*high))
+
+    def by_parts(builder: Any, name: str, count: int, x: Any, y: Any) -> Any:
+        def part(v: Any, at: int) -> Any:
+            lanes = ir.Constant(ir.VectorType(_I32, count), list(range(at, at + count)))
+            return builder.bitcast(builder.shuffle_vector(v, v, lanes), ir.VectorType(ir.IntType(16), 2 * count))
+
+        starts = range(0, LANES, count)
+        parts = [_call(builder, name, ir.VectorType(_I32, count), [part(x, at), part(y, at)]) for at in starts]
+        while len(parts) > 1:
+            size = 2 * parts[0].type.count
+            lanes = ir.Constant(ir.VectorType(_I32, size), list(range(size)))
+            parts = [builder.shuffle_vector(parts[k], parts[k + 1], lanes) for k in range(0, len(parts), 2)]
+        return parts[0]
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if not binding.get_process_triple().startswith("x86_64"):
+            return plain(builder, *args)
+        bits = vector_bits() if config.CPU_NAME is None else 128  # every x86_64 has 128
+        name = {512: "llvm.x86.avx512.pmaddw.d.512", 256: "llvm.x86.avx2.pmadd.wd", 128: "llvm.x86.sse2.pmadd.wd"}[bits]
+        return by_parts(builder, name, bits // 32, *args)
+
+    return a(a, b), generate
 
 
 def _shift(name: str, doc: str, build: Any) -> Any:

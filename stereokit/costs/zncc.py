@@ -45,6 +45,7 @@ from stereokit.kernels.simd import (
     multiply,
     multiply_pairs,
     splat,
+    splat_at,
     store,
     subtract,
 )
@@ -63,13 +64,14 @@ class ZnccRows(NamedTuple):
     left_stride: int
     right: NDArray[np.int16]  # padded and reversed, element (y + half) * right_stride + half + k
     right_stride: int
-    left_sum: NDArray[np.int32]  # sum over the window, element y * W + x
+    left_sum: NDArray[np.int32]  # sum over the window, negative, in the low half; element y * W + x
     left_scale: NDArray[np.float32]  # steps / sqrt(variance), 0 where there is none
     right_sum: NDArray[np.int32]  # element y * right_width + k
     right_scale: NDArray[np.float32]  # 1 / sqrt(variance), 0 where there is none
     right_width: int
     steps: int
     large: tuple[int, ...]  # not empty when steps do not fit a signed byte; known to the compiler
+    factors: NDArray[np.int32]  # n * left pixels of the row that comes (low half), -n * those of the one that goes
     pairs: NDArray[np.int32]  # right pixels of the row that comes (low half) and of the one that goes (high half)
     sums: NDArray[np.int32]  # n times the column sums around row `at`, element ((d // 64) * C + half + x) * 64 + d % 64
     at: NDArray[np.int64]  # (1,): the row whose column sums are held, or -1
@@ -137,9 +139,9 @@ class Zncc:
         tasks = []
         for k, (y0, y1) in enumerate(spans(height, pair.threads)):
             work = workspace.array(f"zncc.work{k}", (4, right_width + 2 * half), np.int32)
-            tasks.append(partial(_statistics, left, y0, y1, self.window, self.steps, work, left_sum, left_scale))
+            tasks.append(partial(_statistics, left, y0, y1, self.window, self.steps, True, work, left_sum, left_scale))
             work = workspace.array(f"zncc.right_work{k}", (4, right_width + 2 * half), np.int32)
-            tasks.append(partial(_statistics, right, y0, y1, self.window, 1, work, right_sum, right_scale))
+            tasks.append(partial(_statistics, right, y0, y1, self.window, 1, False, work, right_sum, right_scale))
         run(tasks, pair.threads)
         cells = cells_of(pair, self.cost_max, workspace)
         producers = []
@@ -161,6 +163,7 @@ class Zncc:
                     right_width,
                     self.steps,
                     (0,) if self.steps > 127 else (),
+                    workspace.array(f"zncc.factors{worker}", width + 2 * half, np.int32),
                     workspace.array(f"zncc.pairs{worker}", right_width + 2 * half, np.int32),
                     workspace.array(f"zncc.sums{worker}", (width + 2 * half) * padded, np.int32),
                     at,
@@ -207,10 +210,10 @@ def _centre(
 
 @kernel
 def _statistics(
-    image: NDArray[np.int16], y0: int, y1: int, window: int, scale: int, work: NDArray[np.int32],
+    image: NDArray[np.int16], y0: int, y1: int, window: int, scale: int, left: bool, work: NDArray[np.int32],
     out_sum: NDArray[np.int32], out_scale: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Window sums and scale / sqrt(variance) of rows y0..y1 of a padded image."""
+    """Window sums and scale / sqrt(variance) of rows y0..y1 of a padded image; sums as the `left` ones are kept."""
     width = out_sum.shape[1]
     sums = work[0, : width + window - 1]
     squares = work[1, : width + window - 1]
@@ -241,49 +244,51 @@ def _statistics(
                 square[x] += squares[x + j]
         for x in range(width):
             variance = np.int32(np.int32(n * square[x]) - np.int32(total[x] * total[x]))
-            out_sum[y, x] = total[x]
+            out_sum[y, x] = np.int32(-total[x]) & np.int32(0xFFFF) if left else total[x]
             root = np.sqrt(np.float32(max(variance, np.int32(1))))
             out_scale[y, x] = np.float32(scale) / root if variance > 0 else np.float32(0)
 
 
 @inline
 def _pair_rows(rows: ZnccRows, row_in: int, row_out: int) -> None:
-    """Put the right pixels of two rows of the padded image side by side; a row of -1 may be any."""
+    """Fill `pairs` and `factors` for a row of the padded images that comes and one that goes; -1 is none."""
     new = max(row_in, 0) * rows.right_stride
     old = max(row_out, 0) * rows.right_stride
     for k in range(rows.pairs.size):
         low = np.int32(rows.right[new + k]) & np.int32(0xFFFF)
         high = np.int32(np.int32(rows.right[old + k]) << np.int32(16))
         rows.pairs[k] = np.int32(low | high)
+    new = max(row_in, 0) * rows.left_stride
+    old = max(row_out, 0) * rows.left_stride
+    n = np.int32((2 * rows.half + 1) ** 2)
+    n_in = n if row_in >= 0 else np.int32(0)
+    n_out = np.int32(-n) if row_out >= 0 else np.int32(0)
+    for c in range(rows.factors.size):
+        low = np.int32(n_in * np.int32(rows.left[new + c])) & np.int32(0xFFFF)
+        high = np.int32(np.int32(n_out * np.int32(rows.left[old + c])) << np.int32(16))
+        rows.factors[c] = np.int32(low | high)
 
 
 @inline
-def _factors(rows: ZnccRows, row_in: int, row_out: int, c: int) -> Any:
-    """Return ``n * new`` and ``-n * old`` of padded left column `c` in the halves of all lanes; 0 for a row of -1."""
-    n = np.int32((2 * rows.half + 1) ** 2)
-    new = np.int32(0)
-    old = np.int32(0)
-    if row_in >= 0:
-        new = np.int32(n * np.int32(rows.left[row_in * rows.left_stride + c]))
-    if row_out >= 0:
-        old = np.int32(-n * np.int32(rows.left[row_out * rows.left_stride + c]))
-    return splat(np.int32((new & np.int32(0xFFFF)) | np.int32(old << np.int32(16))))
+def _column(rows: ZnccRows, at: int, c: int, block: int) -> Any:
+    """Bring the sums of padded column `c`, at element `at`, to the row that `pairs` and `factors` lead to."""
+    theirs = load(rows.pairs, rows.factors.size - 1 - c + block)
+    column = add(load(rows.sums, at), multiply_pairs(theirs, splat_at(rows.factors, c)))
+    store(rows.sums, at, column)
+    return column
 
 
 @inline
 def _start_sums(rows: ZnccRows, y: int) -> None:
     """Fill the column sums with all rows of the window around row `y` but the last."""
-    columns = rows.cells.width + 2 * rows.half
+    columns = rows.factors.size
     for at in range(0, rows.sums.size, LANES):
         store(rows.sums, at, splat(np.int32(0)))
     for row in range(y, y + 2 * rows.half):
-        _pair_rows(rows, row, row)
+        _pair_rows(rows, row, -1)
         for n in range(len(rows.cells.blocks)):
             for c in range(columns):
-                at = (n * columns + c) * LANES
-                theirs = load(rows.pairs, columns - 1 - c + n * LANES)
-                gain = multiply_pairs(theirs, _factors(rows, row, -1, c))
-                store(rows.sums, at, add(load(rows.sums, at), gain))
+                _column(rows, (n * columns + c) * LANES, c, n * LANES)
 
 
 def _to_costs(rho: Any, steps: int, large: tuple[int, ...]) -> Any:
@@ -330,22 +335,19 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
     columns = cells.width + window - 1
     for n in range(len(cells.blocks)):
         block = n * LANES
+        base = n * columns * LANES
+        # One pass: a column's sum is brought to this row, then it enters the window and the oldest leaves.
         total = splat(np.int32(0))
-        for c in range(columns):
-            # One pass: a column's sum is brought to this row, then it enters the window and the oldest leaves.
-            at = (n * columns + c) * LANES
-            gain = multiply_pairs(load(rows.pairs, columns - 1 - c + block), _factors(rows, row_in, row_out, c))
-            column = add(load(rows.sums, at), gain)
-            store(rows.sums, at, column)
-            total = add(total, column)
-            x = c - window + 1
-            if x < 0:
-                continue
+        for c in range(window - 1):
+            total = add(total, _column(rows, base + c * LANES, c, block))
+        for x in range(cells.width):
+            at = base + x * LANES  # of the oldest column
+            total = add(total, _column(rows, at + (window - 1) * LANES, x + window - 1, block))
             k = y * rows.right_width + cells.width - 1 - x + block
-            mine = splat(np.int32(np.int32(-rows.left_sum[y * cells.width + x]) & np.int32(0xFFFF)))
+            mine = splat_at(rows.left_sum, y * cells.width + x)
             numerator = add(total, multiply_pairs(load(rows.right_sum, k), mine))
             rho = multiply(convert(numerator, np.float32(0)), load(rows.right_scale, k))
-            rho = multiply(rho, splat(rows.left_scale[y * cells.width + x]))
+            rho = multiply(rho, splat_at(rows.left_scale, y * cells.width + x))
             store(out, x * padded + block, _to_costs(rho, rows.steps, rows.large))
-            total = subtract(total, load(rows.sums, at - (window - 1) * LANES))
+            total = subtract(total, load(rows.sums, at))
     close_row(cells, y, out)

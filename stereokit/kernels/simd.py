@@ -52,6 +52,7 @@ __all__ = [
     "shift_right",
     "shift_up",
     "splat",
+    "splat_at",
     "store",
     "subtract",
     "vector_bits",
@@ -158,6 +159,18 @@ def splat(typing: Any, scalar: Any) -> Any:
         return _splat_ir(builder, args[0], kind)
 
     return kind(scalar), generate
+
+
+@intrinsic
+def splat_at(typing: Any, array: Any, offset: Any) -> Any:
+    """Return a vector whose lanes all hold element `offset` of the flat `array`; `offset` is not negative."""
+    kind = Vector(array.dtype)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return _splat_ir(builder, builder.load(builder.gep(data, [args[1]])), kind)
+
+    return kind(array, types.intp), generate
 
 
 def _binary(name: str, doc: str, integer: Any, floating: Any = None) -> Any:

@@ -9,6 +9,7 @@ Where what lives (``P`` levels to a pixel, one byte each, all rows of one worker
     least   (3, W)      the smallest path cost of each
     total   (W, P)      16 bit, sum over all paths: what selection reads
     sums    (H, W, P)   sum of the three brackets of the sweep that came first; the only volume
+    kept    (H, W)      smallest path cost of each pixel, where `sums` holds path costs instead (see below)
 
 The diagonal paths stay in place: the path that arrives at column ``x`` in sweep row ``k`` lives in slot ``x - k``
 (modulo W), or ``x + k`` for the other diagonal, so nothing is ever shifted.
@@ -18,6 +19,10 @@ of the pixel before (Hirschmueller 2008, equation 13), so ``0 <= B <= P2``, and 
 ``n * C + sum B``. Costs up to ``C_max`` therefore stay exact in bytes while ``C_max + P2 <= 255``; the three
 brackets of a sweep fit bytes while ``3 * P2 <= 255``, else `sums` is 16 bit. The 255 that pads the levels saturates
 and never wins: seen from a level that exists it offers at least ``255 - C_max >= P2``.
+
+With 4 paths a sweep has one bracket, and costs that are dear to compute are not computed twice: the first visit
+leaves the path costs ``L`` of its vertical path in `sums`. The bracket of row y follows from the path costs of the row
+that the path came from, and what is left of ``L`` is the cost (`recover_row`): the volume holds both.
 """
 
 from __future__ import annotations
@@ -34,6 +39,7 @@ from stereokit.kernels.simd import (
     add,
     add_saturated,
     convert,
+    either,
     load,
     lowest,
     lowest_of_3,
@@ -42,6 +48,7 @@ from stereokit.kernels.simd import (
     shift_down,
     shift_up,
     splat,
+    splat_at,
     store,
     subtract,
 )
@@ -63,6 +70,8 @@ class PathBuffers(NamedTuple):
     least: NDArray[np.uint8]
     penalties: NDArray[np.uint8]  # (2, 4, 2, W): by row, p1 and p2 of each pixel for three paths, then along it
     total: NDArray[np.uint16]
+    kept: NDArray[np.uint8]  # or empty, when costs are computed twice
+    padding: NDArray[np.uint8]  # (P): 0 for levels that exist, 255 for those that pad
 
 
 @inline
@@ -170,8 +179,8 @@ def _verticals(
 ) -> None:
     """Advance the paths from the row before to sweep row `k`.
 
-    `slot` says which of the two rows in the buffers it is. Before the last visit their brackets are added into
-    ``sums[base:]``; at the last one everything is summed into `total`, with what the other sweep left in `sums` if
+    `slot` says which of the two rows in the buffers it is. Before the last visit the sum of their brackets (or the
+    path costs, if those are kept) goes to ``sums[base:]``; at the last one everything is summed into `total`, with what the other sweep left in `sums` if
     `stored`.
     """
     width = buffers.width
@@ -186,6 +195,8 @@ def _verticals(
     turn = k % width
     here = slot * width * padded
     penalties = 8 * slot * width
+    kept = buffers.kept.size > 0
+    row = base // padded
     for x in range(width):
         slot_a = x - turn
         if slot_a < 0:
@@ -266,6 +277,8 @@ def _verticals(
                 if stored:
                     total = add(total, convert(load(sums, base + at), wide))
                 store(buffers.total, at, total)
+            elif kept:
+                store(sums, base + at, convert(path_b, like))
             else:
                 store(sums, base + at, part)
         if buffers.diagonals:
@@ -274,7 +287,10 @@ def _verticals(
             least[width + x] = np.uint8((three >> np.uint32(8)) & np.uint32(255))
             least[2 * width + slot_c] = np.uint8((three >> np.uint32(16)) & np.uint32(255))
         else:
-            least[width + x] = lowest(smallest_b)
+            lowest_b = lowest(smallest_b)
+            least[width + x] = lowest_b
+            if kept and not last:
+                buffers.kept[row + x] = lowest_b
 
 
 @kernel
@@ -293,14 +309,65 @@ def first_visit(
 
 
 @inline
+def recover_row(
+    buffers: PathBuffers, guide: NDArray[np.uint8], p1: NDArray[np.uint8], p2: NDArray[np.uint8], y: int,
+    step: int, to: int, sums: NDArray[Any],
+) -> None:  # fmt: skip
+    """Part the path costs that the other sweep left for row `y` into costs and brackets.
+
+    The costs go to ``buffers.cost[to:]``, the brackets to where the path costs were. Rows must be taken in the order
+    of this sweep: the other one came from row ``y + step``, which must still be as it left it.
+    """
+    width = buffers.width
+    padded = LANES * len(buffers.blocks)
+    like = sums[0]
+    narrow = np.uint8(0)
+    full = splat(np.uint8(255))
+    zero = splat(np.uint8(0))
+    before = y + step
+    first = before < 0 or before >= guide.shape[0]  # there the other sweep began, with brackets of 0
+    _look_up(guide, y, -step, False, False, p1, p2, 0, buffers.penalties)
+    for x in range(width):
+        p1_b = splat_at(buffers.penalties, 2 * width + x)
+        p2_b = splat_at(buffers.penalties, 3 * width + x)
+        at = (y * width + x) * padded
+        source = (before * width + x) * padded
+        low = zero
+        below = full
+        here = zero
+        if not first:
+            low = splat_at(buffers.kept, before * width + x)
+            here = subtract(convert(load(sums, source), narrow), low)
+        for n in range(len(buffers.blocks)):
+            block = n * LANES
+            above = full
+            if n + 1 < len(buffers.blocks) and not first:
+                above = subtract(convert(load(sums, source + block + LANES), narrow), low)
+            bracket = _bracket(below, here, above, p1_b, p2_b)
+            if first:
+                bracket = zero
+            cost = subtract(convert(load(sums, at + block), narrow), bracket)
+            if n + 1 == len(buffers.blocks):
+                cost = either(cost, load(buffers.padding, block))
+            store(buffers.cost, to + x * padded + block, cost)
+            store(sums, at + block, convert(bracket, like))
+            below = here
+            here = above
+
+
+@inline
 def prepare_rows(
     rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], p1: NDArray[np.uint8], p2: NDArray[np.uint8],
-    y: int, step: int, count: int,
+    y: int, step: int, count: int, sums: NDArray[Any],
 ) -> None:  # fmt: skip
     """Costs, penalties and paths along the row of row `y` and, if `count` is 2, of the next one of the sweep."""
     size = buffers.width * LANES * len(buffers.blocks)
     for n in range(count):
-        cost_row(rows, y + n * step, buffers.cost[n * size : (n + 1) * size])
+        if buffers.kept.size > 0:
+            recover_row(buffers, guide, p1, p2, y + n * step, step, n * size, sums)
+        else:
+            cost_row(rows, y + n * step, buffers.cost[n * size : (n + 1) * size])
+    for n in range(count):
         base = 8 * n * buffers.width
         _look_up(guide, y + n * step, step, buffers.diagonals, True, p1, p2, base, buffers.penalties)
     _horizontals(buffers, count)

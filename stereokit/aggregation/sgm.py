@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.aggregation._paths import PathBuffers, finish_row, first_visit, prepare_rows, start
-from stereokit.costs.rows import Cost, Levels
+from stereokit.costs.rows import WORST, Cost, Levels
 from stereokit.errors import OptionError
 from stereokit.inputs import check_integer, check_number
 from stereokit.kernels.jit import kernel
@@ -124,6 +124,11 @@ class Sgm:
         both = self.paths != 5
         sums = workspace.array("sgm.sums", height * size if both else 1, sums_dtype)
         keep = np.empty(0, np.uint16) if total is None else total.reshape(-1)
+        once = self.paths == 4 and cost.dear
+        kept = workspace.array("sgm.kept", height * width if once else 0, np.uint8)
+        padding = workspace.array("sgm.padding", levels.padded, np.uint8)
+        padding[: levels.count] = 0
+        padding[levels.count :] = WORST
         workers = []
         for k in range(2 if both else 1):
             buffers = PathBuffers(
@@ -138,6 +143,8 @@ class Sgm:
                 workspace.array(f"sgm.least{k}", 3 * width, np.uint8),
                 workspace.array(f"sgm.penalties{k}", 16 * width, np.uint8),
                 workspace.array(f"sgm.total{k}", size, np.uint16),
+                kept,
+                padding,
             )
             start(buffers)
             workers.append(buffers)
@@ -177,7 +184,7 @@ def _last_visit(
         y = y0 + k * step
         slot = k % 2
         if slot == 0:
-            prepare_rows(rows, buffers, guide, p1, p2, y, step, min(2, visits - k))
+            prepare_rows(rows, buffers, guide, p1, p2, y, step, min(2, visits - k), sums)
         finish_row(buffers, slot, y, k0 + k, sums, stored)
         if total.size > 0:
             for at in range(0, size, LANES):

@@ -69,6 +69,11 @@ class Census:
         """Penalties are given in neighbours that differ: one unit of cost."""
         return 1
 
+    @property
+    def dear(self) -> bool:
+        """Whether a row costs more to compute again than to bring back from a volume."""
+        return self.window == "9x7"
+
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[CensusRows]:
         """Transform both images; return the row producers of `workers` sweeps."""
         height, width = pair.left.shape

@@ -109,6 +109,10 @@ class Cost(Protocol):
     def unit(self) -> int:
         """Steps of cost per unit in which users give penalties."""
 
+    @property
+    def dear(self) -> bool:
+        """Whether a row costs more to compute again than to bring back from a volume."""
+
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[Any]:
         """Prepare an image pair; return a row producer, a named tuple, for each of `workers` sweeps."""
 

@@ -116,6 +116,11 @@ class Zncc:
         """Largest grey range for which n times a centred pixel fits 16 bits."""
         return 2 * (2**15 - 1) // (self.window * self.window)
 
+    @property
+    def dear(self) -> bool:
+        """Whether a row costs more to compute again than to bring back from a volume."""
+        return True
+
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[ZnccRows]:
         """Compute the window statistics; return the row producers of `workers` sweeps."""
         half = self.window // 2

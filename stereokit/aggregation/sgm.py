@@ -22,7 +22,7 @@ from stereokit.costs.rows import WORST, Cost, Levels
 from stereokit.errors import OptionError
 from stereokit.inputs import check_integer, check_number
 from stereokit.kernels.jit import kernel
-from stereokit.kernels.pool import run
+from stereokit.kernels.pool import run_stages
 from stereokit.kernels.simd import LANES, load, store
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
@@ -153,19 +153,18 @@ class Sgm:
             return
         middle = height // 2
         a, b = workers
-        run(
+        run_stages(
             [
-                lambda: first_visit(rows[0], a, guide, p1, p2, 0, middle, sums),
-                lambda: first_visit(rows[1], b, guide, p1, p2, height - 1, middle - 1, sums),
-            ],
-            threads,
-        )
-        run(
-            [
-                lambda: _last_visit(rows[0], a, guide, p1, p2, middle, height, 1, middle, sums, True, out, keep),
-                lambda: _last_visit(
-                    rows[1], b, guide, p1, p2, middle - 1, -1, -1, height - middle, sums, True, out, keep
-                ),
+                [
+                    lambda: first_visit(rows[0], a, guide, p1, p2, 0, middle, sums),
+                    lambda: first_visit(rows[1], b, guide, p1, p2, height - 1, middle - 1, sums),
+                ],
+                [
+                    lambda: _last_visit(rows[0], a, guide, p1, p2, middle, height, 1, middle, sums, True, out, keep),
+                    lambda: _last_visit(
+                        rows[1], b, guide, p1, p2, middle - 1, -1, -1, height - middle, sums, True, out, keep
+                    ),
+                ],
             ],
             threads,
         )

@@ -34,7 +34,7 @@ from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements
 from stereokit.errors import OptionError
 from stereokit.inputs import check_integer
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.pool import run, spans
+from stereokit.kernels.pool import run_stages, spans
 from stereokit.kernels.simd import (
     LANES,
     add,
@@ -131,23 +131,32 @@ class Zncc:
         right_width = width + padded
         right = workspace.array("zncc.right", (rows, right_width + 2 * half), np.int16)
         start = width - 1 - pair.levels.minimum + half
-        scales = self._scale(pair.left), self._scale(pair.right)
         left_sum = workspace.array("zncc.left_sum", (height, width), np.int32)
         left_scale = workspace.array("zncc.left_scale", (height, width), np.float32)
         right_sum = workspace.array("zncc.right_sum", (height, right_width), np.int32)
         right_scale = workspace.array("zncc.right_scale", (height, right_width), np.float32)
-        tasks: list[Any] = []
-        for y0, y1 in spans(rows, pair.threads):
-            tasks.append(partial(_centre, pair.left, y0, y1, half, 1, -half, *scales[0], left))
-            tasks.append(partial(_centre, pair.right, y0, y1, half, -1, start, *scales[1], right))
-        run(tasks, pair.threads)
-        tasks = []
-        for k, (y0, y1) in enumerate(spans(height, pair.threads)):
+        scales: dict[bool, tuple[int, np.float32]] = {}
+
+        def measure(of_left: bool) -> None:
+            scales[of_left] = self._scale(pair.left if of_left else pair.right)
+
+        def centre(y0: int, y1: int, of_left: bool) -> None:
+            if of_left:
+                _centre(pair.left, y0, y1, half, 1, -half, *scales[True], left)
+            else:
+                _centre(pair.right, y0, y1, half, -1, start, *scales[False], right)
+
+        def summarise(k: int, y0: int, y1: int) -> None:
             work = workspace.array(f"zncc.work{k}", (4, right_width + 2 * half), np.int32)
-            tasks.append(partial(_statistics, left, y0, y1, self.window, self.steps, True, work, left_sum, left_scale))
-            work = workspace.array(f"zncc.right_work{k}", (4, right_width + 2 * half), np.int32)
-            tasks.append(partial(_statistics, right, y0, y1, self.window, 1, False, work, right_sum, right_scale))
-        run(tasks, pair.threads)
+            _statistics(left, y0, y1, self.window, self.steps, True, work, left_sum, left_scale)
+            _statistics(right, y0, y1, self.window, 1, False, work, right_sum, right_scale)
+
+        stages: list[list[Any]] = [
+            [partial(measure, True), partial(measure, False)],
+            [partial(centre, y0, y1, of_left) for y0, y1 in spans(rows, pair.threads) for of_left in (True, False)],
+            [partial(summarise, k, y0, y1) for k, (y0, y1) in enumerate(spans(height, pair.threads))],
+        ]
+        run_stages(stages, pair.threads)
         cells = cells_of(pair, self.cost_max, workspace)
         producers = []
         for worker in range(workers):

@@ -11,7 +11,9 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
-__all__ = ["available_threads", "run", "spans"]
+from stereokit.kernels.gate import meet, new_gate, open_for_good
+
+__all__ = ["available_threads", "run", "run_stages", "spans"]
 
 _lock = threading.Lock()
 _executor: ThreadPoolExecutor | None = None
@@ -43,11 +45,6 @@ if hasattr(os, "register_at_fork"):  # a forked child has no worker threads: it 
     os.register_at_fork(after_in_child=_forget_executor)
 
 
-def _run_all(tasks: Sequence[Callable[[], object]]) -> None:
-    for task in tasks:
-        task()
-
-
 def _wait_for(others: list[Future[None]]) -> None:
     """Wait until all have ended, however often the user interrupts: until then they write to borrowed buffers."""
     interrupted: KeyboardInterrupt | None = None
@@ -61,20 +58,60 @@ def _wait_for(others: list[Future[None]]) -> None:
         raise interrupted
 
 
-def run(tasks: Sequence[Callable[[], object]], threads: int) -> None:
+Task = Callable[[], object]
+
+
+def run(tasks: Sequence[Task], threads: int) -> None:
     """Run all `tasks`, at most `threads` at a time, and return when all have ended.
 
     The calling thread does its share. The first exception of any task is raised again. A task must not call
     `run` itself.
     """
-    count = min(threads, len(tasks))
+    run_stages([tasks], threads)
+
+
+def run_stages(stages: Sequence[Sequence[Task]], threads: int) -> None:
+    """Run the tasks of each stage, at most `threads` at a time, when all of the stage before have ended.
+
+    With two threads the work is handed over once, and the two meet at a gate between stages.
+    """
+    count = min(threads, max(map(len, stages), default=0))
+    if count > 2:
+        # Members of a gate must all be running. More than two might be waiting in the pool's queue, behind members of
+        # other gates that wait for members in the queue. One is never alone: the other is the caller.
+        for stage in stages:
+            _run_together([stage], min(count, len(stage)))
+    else:
+        _run_together(stages, count)
+
+
+def _run_together(stages: Sequence[Sequence[Task]], count: int) -> None:
     if count <= 1:
-        _run_all(tasks)
+        for stage in stages:
+            for task in stage:
+                task()
         return
+    gate = new_gate()
+
+    def work(k: int) -> None:
+        try:
+            for number, stage in enumerate(stages):
+                if number > 0 and not meet(gate, count):
+                    return
+                for task in stage[k::count]:
+                    task()
+        except BaseException:
+            open_for_good(gate)
+            raise
+
     pool = _shared_executor()
-    others = [pool.submit(_run_all, tasks[k::count]) for k in range(1, count)]
+    others: list[Future[None]] = []
     try:
-        _run_all(tasks[0::count])
+        others += [pool.submit(work, k) for k in range(1, count)]
+        work(0)
+    except BaseException:
+        open_for_good(gate)
+        raise
     finally:
         _wait_for(others)
     for other in others:

@@ -37,10 +37,11 @@ __all__ = [
     "count_bits",
     "either",
     "first_bit",
+    "first_lane",
     "less_bit",
     "load",
     "lowest",
-    "lowest_of_3",
+    "lowest_of_4",
     "mask_equal",
     "maximum",
     "minimum",
@@ -382,11 +383,12 @@ def lowest(typing: Any, value: Any) -> Any:
 
 
 @intrinsic
-def lowest_of_3(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return the smallest lanes of three ``uint8`` vectors in the three low bytes of a ``uint32``.
+def lowest_of_4(typing: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Return, for each of four ``uint8`` vectors, a vector whose lanes all hold its smallest lane.
 
-    One tree for the three costs hardly more than one alone: the vectors are interleaved as they are halved.
+    One tree for the four costs hardly more than one alone: the vectors are interleaved as they are halved.
     """
+    result = types.UniTuple(a, 4)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def shuffle(x: Any, y: Any, lanes: list[int]) -> Any:
@@ -408,18 +410,28 @@ def lowest_of_3(typing: Any, a: Any, b: Any, c: Any) -> Any:
         def zip_least(x: Any, y: Any, size: int) -> Any:
             return least(shuffle(x, y, unpack(size, False)), shuffle(x, y, unpack(size, True)))
 
-        first, second, third = args
-        value = zip_least(zip_least(first, second, 1), zip_least(third, third, 1), 2)  # a b c c  a b c c ...
+        first, second, third, fourth = args
+        value = zip_least(zip_least(first, second, 1), zip_least(third, fourth, 1), 2)  # a b c d  a b c d ...
         for n in (32, 16):
             none = ir.Constant(value.type, ir.Undefined)
             value = least(shuffle(value, none, list(range(n))), shuffle(value, none, list(range(n, 2 * n))))
         for n in (8, 4):
             none = ir.Constant(value.type, ir.Undefined)
             value = least(value, shuffle(value, none, [(n + i) % 16 for i in range(16)]))
-        packed = builder.bitcast(value, ir.VectorType(_I32, 4))
-        return builder.extract_element(packed, ir.Constant(_I32, 0))
+        none = ir.Constant(value.type, ir.Undefined)
+        return context.make_tuple(builder, result, [shuffle(value, none, [n] * LANES) for n in range(4)])
 
-    return types.uint32(a, b, c), generate
+    return result(a, b, c, d), generate
+
+
+@intrinsic
+def first_lane(typing: Any, value: Any) -> Any:
+    """Return lane 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.extract_element(args[0], ir.Constant(_I32, 0))
+
+    return value.scalar(value), generate
 
 
 @intrinsic

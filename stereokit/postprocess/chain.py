@@ -79,6 +79,8 @@ def post_process(
     size = flat.size if chain.speckle else 0
     label, parent, count = (workspace.array(f"speckle.{name}", size, np.int32) for name in ("label", "parent", "count"))
     limit = np.float32(1)
+    out = np.empty_like(disparity)
+    incomplete: list[int] = []  # bands with rows that have nothing to be filled from
 
     def match(k: int, y0: int, y1: int) -> None:
         if bad is not None:
@@ -96,24 +98,28 @@ def post_process(
         if chain.speckle:
             erase(flat, y0 * width, y1 * width, chain.speckle, label, parent, count)
         _mark_valid(flat, y0 * width, y1 * width, valid.reshape(-1))
-        if chain.fill is not None:
-            fill_rows(disparity, y0, y1, chain.fill == "nearest")
+        if chain.fill is not None and fill_rows(disparity, y0, y1, chain.fill == "nearest"):
+            incomplete.append(y0)
 
-    def complete() -> None:
-        if chain.fill is not None and not fill_empty_rows(disparity):
-            disparity[:] = chain.nothing
+    def smooth_rows(y0: int, y1: int) -> None:
+        if incomplete:
+            return
+        if chain.median:
+            median_rows(disparity, chain.median, y0, y1, out, workspace)
+        else:
+            out[y0:y1] = disparity[y0:y1]
 
     stages: list[list[Any]] = [[partial(match, k, y0, y1) for k, (y0, y1) in enumerate(parts)]]
     if chain.speckle and len(parts) > 1:
         stages.append([join])
     stages.append([partial(clean, y0, y1) for y0, y1 in parts])
-    stages.append([complete])
-    out = np.empty_like(disparity)
-    if chain.median:
-        stages.append([partial(median_rows, disparity, chain.median, y0, y1, out, workspace) for y0, y1 in parts])
-    else:
-        stages.append([partial(np.copyto, out, disparity)])
+    stages.append([partial(smooth_rows, y0, y1) for y0, y1 in parts])
     run_stages(stages, threads)
+    if incomplete:  # rare: rows without any valid pixel take those of others
+        incomplete.clear()
+        if not fill_empty_rows(disparity):
+            disparity[:] = chain.nothing
+        run_stages(stages[-1:], threads)
     return out, valid
 
 

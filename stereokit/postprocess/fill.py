@@ -58,9 +58,10 @@ def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: i
 
 
 @kernel
-def fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -> None:
-    """Fill the gaps of rows y0..y1 that have a valid pixel, in place."""
+def fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -> int:
+    """Fill the gaps of rows y0..y1 that have a valid pixel, in place; return how many rows have none."""
     width = disparity.shape[1]
+    empty = 0
     for y in range(y0, y1):
         row = disparity[y]
         last = -1  # the last valid column
@@ -79,6 +80,9 @@ def fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -
             last = x
         if last >= 0:
             row[last + 1 :] = row[last]
+        else:
+            empty += 1
+    return empty
 
 
 def fill_empty_rows(disparity: NDArray[np.float32]) -> bool:

@@ -31,7 +31,7 @@ from stereokit.inputs import (
     half_size,
     smooth,
 )
-from stereokit.kernels.pool import available_threads
+from stereokit.kernels.pool import available_threads, crew
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.methods import check_levels, option_names, parse_method
 from stereokit.postprocess.chain import Chain, post_process
@@ -259,7 +259,11 @@ class Matcher:
         return refined
 
     def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace, threads: int) -> Disparity:
-        levels = Levels(low, high - low)
+        with crew(threads):
+            return self._match_with_crew(pair, Levels(low, high - low), workspace, threads)
+
+    def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
+        low = levels.minimum
         pair = smooth(pair, self.smooth, workspace, threads)
         shape = pair.left.shape
         rows = self.cost.prepare(

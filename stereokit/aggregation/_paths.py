@@ -101,7 +101,10 @@ def _bracket(below: Any, here: Any, above: Any, p1: Any, p2: Any) -> Any:
 @kernel
 def start(buffers: PathBuffers) -> None:
     """Begin a sweep: no path has come from anywhere yet."""
-    buffers.state[:] = 0
+    zero = splat(np.uint8(0))
+    size = buffers.width * LANES * len(buffers.blocks)
+    for at in range(0 if buffers.diagonals else size, 3 * size if buffers.diagonals else 2 * size, LANES):
+        store(buffers.state, at, zero)
     buffers.least[:] = 0
 
 
@@ -342,7 +345,8 @@ def _verticals(
 
 @kernel
 def first_visit(
-    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, sums: NDArray[Any],
+    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int,
+    sums: NDArray[Any],
 ) -> None:  # fmt: skip
     """Sweep from row `y0` to before row `y1` (upwards when y1 < y0); leave the brackets in `sums`."""
     step = 1 if y1 > y0 else -1
@@ -356,9 +360,10 @@ def first_visit(
 
 @inline
 def recover_row(
-    buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y: int, step: int, to: int, sums: NDArray[Any],
+    buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y: int, step: int, to: int,
+    sums: NDArray[Any],
 ) -> None:  # fmt: skip
-    """Take the brackets off the path costs that the other sweep left for row `y`; the costs go to ``buffers.cost[to:]``.
+    """Take the brackets off the path costs that the other sweep left for row `y`; costs go to ``buffers.cost[to:]``.
 
     The other sweep came from row ``y + step``.
     """
@@ -399,7 +404,8 @@ def recover_row(
 
 @inline
 def prepare_rows(
-    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y: int, step: int, count: int, sums: NDArray[Any],
+    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y: int, step: int,
+    count: int, sums: NDArray[Any],
 ) -> None:  # fmt: skip
     """Costs, penalties and paths along the row of row `y` and, if `count` is 2, of the next one of the sweep."""
     size = buffers.width * LANES * len(buffers.blocks)

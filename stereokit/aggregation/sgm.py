@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -115,8 +116,39 @@ class Sgm:
         total : (H, W, P) uint16 or None
             Where the sums over all paths go, if they are wanted.
         """
+        height = guide.shape[0]
+        key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.dear
+        penalties, sums, workers = workspace.once(
+            "sgm", key, lambda: self._buffers(guide.shape, levels, cost, workspace)
+        )
+        keep = np.empty(0, np.uint16) if total is None else total.reshape(-1)
+        if len(workers) == 1:
+            start(workers[0])
+            _last_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out, keep)
+            return
+        middle = height // 2
+
+        def first(k: int, y0: int, y1: int) -> None:
+            start(workers[k])
+            first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums)
+
+        def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
+            _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, keep)
+
+        run_stages(
+            [
+                [partial(first, 0, 0, middle), partial(first, 1, height - 1, middle - 1)],
+                [partial(last, 0, middle, height, 1, middle), partial(last, 1, middle - 1, -1, -1, height - middle)],
+            ],
+            threads,
+        )
+
+    def _buffers(
+        self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace
+    ) -> tuple[Penalties, NDArray[Any], list[PathBuffers]]:
+        """Return the penalties, the volume of sums and the buffers of each sweep."""
         penalties = self.penalties(cost.cost_max, cost.unit)
-        height, width = guide.shape
+        height, width = shape
         size = width * levels.padded
         diagonals = self.paths != 4
         most = int(max(penalties.p2, penalties.p2_edge))
@@ -124,15 +156,11 @@ class Sgm:
         across_dtype = np.uint8 if 2 * most <= 255 else np.uint16
         both = self.paths != 5
         sums = workspace.array("sgm.sums", height * size if both else 1, sums_dtype)
-        keep = np.empty(0, np.uint16) if total is None else total.reshape(-1)
-        once = self.paths == 4 and cost.dear
-        kept = workspace.array("sgm.kept", height * width if once else 0, np.uint8)
-        padding = workspace.array("sgm.padding", levels.padded, np.uint8)
-        padding[: levels.count] = 0
+        kept = workspace.array("sgm.kept", height * width if self.paths == 4 and cost.dear else 0, np.uint8)
+        padding = np.zeros(levels.padded, np.uint8)
         padding[levels.count :] = WORST
-        workers = []
-        for k in range(2 if both else 1):
-            buffers = PathBuffers(
+        workers = [
+            PathBuffers(
                 tuple(range(levels.padded // LANES)),
                 diagonals,
                 self.paths,
@@ -148,28 +176,9 @@ class Sgm:
                 kept,
                 padding,
             )
-            start(buffers)
-            workers.append(buffers)
-        if not both:
-            _last_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out, keep)
-            return
-        middle = height // 2
-        a, b = workers
-        run_stages(
-            [
-                [
-                    lambda: first_visit(rows[0], a, guide, penalties, 0, middle, sums),
-                    lambda: first_visit(rows[1], b, guide, penalties, height - 1, middle - 1, sums),
-                ],
-                [
-                    lambda: _last_visit(rows[0], a, guide, penalties, middle, height, 1, middle, sums, True, out, keep),
-                    lambda: _last_visit(
-                        rows[1], b, guide, penalties, middle - 1, -1, -1, height - middle, sums, True, out, keep
-                    ),
-                ],
-            ],
-            threads,
-        )
+            for k in range(2 if both else 1)
+        ]
+        return penalties, sums, workers
 
 
 @kernel

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from llvmlite import binding, ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -20,8 +21,11 @@ from stereokit.kernels.jit import kernel
 
 __all__ = ["meet", "new_gate", "open_for_good"]
 
+_I32 = ir.IntType(32)
 _PATIENCE = 256
-"""Looks at the gate before the processor is offered to others, each some tens of nanoseconds."""
+"""Looks at the gate, each some tens of nanoseconds, before the processor is offered to others between looks."""
+_LONG_PATIENCE = 50_000
+"""Looks after which the waiting thread sleeps between them: some tens of milliseconds."""
 
 
 def new_gate() -> NDArray[np.int64]:
@@ -61,24 +65,25 @@ def _look(typing: Any, gate: Any, index: Any) -> Any:
 
 
 @intrinsic
-def _pause(typing: Any, others: Any) -> Any:
-    """Wait a moment; if `others`, let another thread have the processor, where the system has a call for that."""
+def _pause(typing: Any, looks: Any) -> Any:
+    """Wait a moment, longer after many `looks`; on Windows the processor is kept."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def call(name: str, result: Any, *values: Any) -> None:
+            kind = ir.FunctionType(result, [value.type for value in values])
+            builder.call(cgutils.get_or_insert_function(builder.module, kind, name), values)
+
         if os.name == "posix":
-            with builder.if_then(args[0], likely=False):
-                function = ir.FunctionType(ir.IntType(32), [])
-                builder.call(_declare(builder.module, function, "sched_yield"), [])
+            with builder.if_then(builder.icmp_signed(">", args[0], ir.Constant(args[0].type, _PATIENCE)), likely=False):
+                call("sched_yield", _I32)
+            many = builder.icmp_signed(">", args[0], ir.Constant(args[0].type, _LONG_PATIENCE))
+            with builder.if_then(many, likely=False):
+                call("usleep", _I32, ir.Constant(_I32, 50))
         if binding.get_process_triple().startswith("x86_64"):
-            function = ir.FunctionType(ir.VoidType(), [])
-            builder.call(_declare(builder.module, function, "llvm.x86.sse2.pause"), [])
+            call("llvm.x86.sse2.pause", ir.VoidType())
         return context.get_dummy_value()
 
-    return types.void(types.boolean), generate
-
-
-def _declare(module: Any, function: Any, name: str) -> Any:
-    return module.globals.get(name) or ir.Function(module, function, name)
+    return types.void(types.int64), generate
 
 
 @kernel
@@ -90,5 +95,5 @@ def meet(gate: NDArray[np.int64], members: int) -> bool:
         if _look(gate, 1) != 0:
             return False
         looks += 1
-        _pause(looks > _PATIENCE)
+        _pause(looks)
     return _look(gate, 1) == 0

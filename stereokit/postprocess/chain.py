@@ -105,7 +105,7 @@ def post_process(
         if incomplete:
             return
         if chain.median:
-            median_rows(disparity, chain.median, y0, y1, out, workspace)
+            median_rows(disparity, chain.median, y0, y1, out, workspace, chain.fill is not None)
         else:
             out[y0:y1] = disparity[y0:y1]
 

@@ -49,13 +49,16 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
 
 def median_rows(
     source: NDArray[np.float32], size: int, y0: int, y1: int, out: NDArray[np.float32],
-    workspace: Workspace | None = None,
+    workspace: Workspace | None = None, dense: bool = False,
 ) -> None:  # fmt: skip
-    """Write rows y0..y1 of the filtered map to `out`; the same values however the rows are cut into ranges."""
+    """Write rows y0..y1 of the filtered map to `out`; the same values however the rows are cut into ranges.
+
+    `dense` promises that no pixel is NaN.
+    """
     half = size // 2
     top, bottom = max(y0 - half, 0), min(y1 + half, source.shape[0])
     part = source[top:bottom]
-    if np.isnan(part).any():
+    if not dense and np.isnan(part).any():
         _median_of_valid(source, half, y0, y1, np.empty(size * size, np.float32), out)
     elif top == y0 and bottom == y1:
         cv2.medianBlur(part, size, dst=out[y0:y1])

@@ -64,12 +64,11 @@ def resolve_rows(
         owner[:] = -1
         for x in range(width):
             d = row[x]
-            if not np.isfinite(d):
-                continue
-            xr = np.int64(np.floor(np.float32(x) - d + np.float32(0.5)))
-            if xr < 0 or xr >= width:
+            at = np.float32(x) - d + np.float32(0.5)
+            if not (at >= np.float32(0) and at < np.float32(width)):  # NaN is neither
                 row[x] = np.nan
                 continue
+            xr = np.int64(np.int32(at))
             held = owner[xr]
             if held < 0:
                 owner[xr] = np.int32(x)

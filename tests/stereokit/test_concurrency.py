@@ -186,6 +186,7 @@ def test_workers_are_waited_for_after_an_interrupt():
         time.sleep(0.5)
         ended.append(True)
 
+    pool.run([lambda: None, lambda: None], 2)  # compiles: numba loses signals meanwhile
     timer = threading.Timer(0.1, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
     timer.start()
     with pytest.raises(KeyboardInterrupt):

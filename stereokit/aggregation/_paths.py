@@ -79,7 +79,8 @@ class PathBuffers(NamedTuple):
     diagonals: bool
     paths: int
     width: int
-    narrow: bool  # 4 paths, and 4 costs and a bracket fit a byte
+    small: bool  # 4 paths, and 4 costs and a bracket fit a byte
+    few: bool  # what is stored of the other sweep and the brackets along the row fit a byte together
     cost: NDArray[np.uint8]
     across: NDArray[Any]
     chains: NDArray[np.uint8]
@@ -234,6 +235,7 @@ def _verticals(
     least = buffers.least
     full = splat(np.uint8(255))
     zero = splat(np.uint8(0))
+    narrow = np.uint8(0)
     wide = np.uint16(0)
     # Kept path costs hold one cost themselves.
     times = splat(np.uint16(buffers.paths - 1 if buffers.kept.size > 0 else buffers.paths))
@@ -318,14 +320,19 @@ def _verticals(
                 here_c = above_c
                 part = add(part, add(convert(bracket_a, like), convert(bracket_c, like)))
             if last:
-                if buffers.narrow:
+                if buffers.small:
                     twice = add(cost, cost)
                     total = convert(add(add(twice, cost if kept else twice), bracket_b), wide)
                 else:
                     total = add(convert(part, wide), multiply(convert(cost, wide), times))
-                total = add(total, convert(load(buffers.across, here + at), wide))
-                if stored:
-                    total = add(total, convert(load(sums, base + at), wide))
+                across = load(buffers.across, here + at)
+                if stored and buffers.few:
+                    others = add(convert(across, narrow), convert(load(sums, base + at), narrow))
+                    total = add(total, convert(others, wide))
+                else:
+                    total = add(total, convert(across, wide))
+                    if stored:
+                        total = add(total, convert(load(sums, base + at), wide))
                 store(buffers.total, at - x0 * padded, total)
             elif kept:
                 store(sums, base + at, convert(path_b, like))

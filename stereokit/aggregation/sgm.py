@@ -166,6 +166,7 @@ class Sgm:
                 self.paths,
                 width,
                 self.paths == 4 and 4 * cost.cost_max + most <= 255,
+                (5 if diagonals else 3) * most + (cost.cost_max if kept.size else 0) <= 255,
                 workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
                 workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
                 workspace.array(f"sgm.chains{k}", 4 * levels.padded, np.uint8),

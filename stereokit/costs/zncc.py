@@ -85,7 +85,7 @@ class Zncc:
     Parameters
     ----------
     window : int
-        Side of the square window in pixels, odd, 3 or more.
+        Side of the square window in pixels, odd, 3 to 127.
     steps : int
         The cost 1 as an integer, 1 to 254.
     """
@@ -95,7 +95,7 @@ class Zncc:
     name: ClassVar[str] = "zncc"
 
     def __post_init__(self) -> None:
-        window = check_integer("window", self.window, 3, 255)
+        window = check_integer("window", self.window, 3, 127)
         if window % 2 == 0:
             raise OptionError(f"window must be odd, got {window}")
         object.__setattr__(self, "window", window)
@@ -114,7 +114,7 @@ class Zncc:
     @property
     def range_max(self) -> int:
         """Largest grey range for which n times a centred pixel fits 16 bits."""
-        return 2 * (2**15 - 1) // (self.window * self.window)
+        return 2 * ((2**15 - 1) // (self.window * self.window))
 
     @property
     def dear(self) -> bool:

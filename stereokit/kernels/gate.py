@@ -96,4 +96,5 @@ def meet(gate: NDArray[np.int64], members: int) -> bool:
             return False
         looks += 1
         _pause(looks)
-    return _look(gate, 1) == 0
+    held: bool = _look(gate, 1) == 0
+    return held

@@ -20,12 +20,12 @@ _BITS = 15  # of the weights: 16-bit values times weights that sum to 2**15 fit 
 
 
 def taps(sigma: float) -> NDArray[np.uint32]:
-    """Return the weights from the centre outwards, cut off where they are below 1/3000 of the first."""
+    """Return the weights from the centre outwards, until they round to 0."""
     radius = max(1, math.ceil(4 * sigma))
     shares = np.exp(-(np.arange(radius + 1) ** 2) / (2 * sigma**2))
     weights = np.rint(2**_BITS * shares / (shares[0] + 2 * shares[1:].sum())).astype(np.int64)
     weights[0] = 2**_BITS - 2 * weights[1:].sum()
-    return np.trim_zeros(weights, "b").astype(np.uint32)
+    return np.asarray(np.trim_zeros(weights, "b"), np.uint32)
 
 
 @kernel

@@ -1,7 +1,7 @@
 """Gaussian filter of grey images in 16 bits: columns, then rows, in fixed point, so that every processor agrees.
 
-Rows are filtered one at a time while they are in the cache, with each tap a loop that becomes vector code. Both
-passes round, so that a result is within one of the exact one.
+Rows are filtered one at a time while they are in the cache, with each tap a loop that becomes vector code. Rounding, of
+the weights first of all, moves a result by one or two of 65536 levels.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from stereokit.kernels.jit import kernel
 
 __all__ = ["blur_rows", "taps"]
 
-_BITS = 15  # of the weights: 16-bit values times weights that sum to 2**15 fit 32 bits
+_BITS = 15  # of the weights: 17-bit values times weights that sum to 2**15 fit 32 bits, with what rounding adds
 
 
 def taps(sigma: float) -> NDArray[np.uint32]:
@@ -36,14 +36,16 @@ def blur_rows(
     """Write rows y0..y1 of ``image << shift``, filtered; borders are replicated. `line` holds W + 2 * radius."""
     height, width = image.shape
     radius = weights.size - 1
-    bits = np.uint32(_BITS)
-    half = np.uint32(1 << (_BITS - 1))
+    once = np.uint32(_BITS - 1)  # between the passes values have one bit more
+    twice = np.uint32(_BITS + 1)
+    half_once = np.uint32(1 << (_BITS - 2))
+    half_twice = np.uint32(1 << _BITS)
     left = np.uint32(shift)
     for y in range(y0, y1):
         middle = line[radius : radius + width]
         centre = image[y]
         for x in range(width):
-            total[x] = np.uint32(np.uint32(np.uint32(centre[x]) << left) * weights[0]) + half
+            total[x] = np.uint32(np.uint32(np.uint32(centre[x]) << left) * weights[0]) + half_once
         for k in range(1, weights.size):
             weight = weights[k]
             above = image[max(y - k, 0)]
@@ -52,11 +54,11 @@ def blur_rows(
                 pair = np.uint32(np.uint32(np.uint32(above[x]) + np.uint32(below[x])) << left)
                 total[x] = np.uint32(total[x] + np.uint32(pair * weight))
         for x in range(width):
-            middle[x] = np.uint32(total[x] >> bits)
+            middle[x] = np.uint32(total[x] >> once)
         line[:radius] = middle[0]
         line[radius + width :] = middle[width - 1]
         for x in range(width):
-            total[x] = np.uint32(np.uint32(middle[x] * weights[0]) + half)
+            total[x] = np.uint32(np.uint32(middle[x] * weights[0]) + half_twice)
         for k in range(1, weights.size):
             weight = weights[k]
             before = line[radius - k : radius - k + width]
@@ -66,4 +68,4 @@ def blur_rows(
                 total[x] = np.uint32(total[x] + np.uint32(pair * weight))
         target = out[y]
         for x in range(width):
-            target[x] = np.uint16(total[x] >> bits)
+            target[x] = np.uint16(total[x] >> twice)

@@ -139,11 +139,12 @@ def _watched(matcher: Any, watch: _Watch) -> Iterator[None]:
 def _targets(matcher: Any) -> list[tuple[Any, str, str]]:
     """Return where each stage's name is looked up: owner, attribute and the name to report."""
     found: list[tuple[Any, str, str]] = []
+    homes: dict[str, Any] = {}
     for attribute, value in vars(matching).items():
         if isinstance(value, FunctionType) and value.__module__.startswith(_STAGES):
             found.append((matching, attribute, _words(attribute)))
-            home = sys.modules[value.__module__]
-            found += [(home, part, f"{_words(attribute)}: {_words(part)}") for part in _kernels(home)]
+            homes[value.__module__] = sys.modules[value.__module__]
+    found += [(home, part, _words(part)) for home in homes.values() for part in _kernels(home)]
     for stage, attribute, name in (
         (getattr(matcher, "cost", None), "prepare", "prepare cost"),
         (getattr(matcher, "aggregation", None), "sweep", "sweep, around its kernels"),

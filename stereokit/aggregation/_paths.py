@@ -24,6 +24,20 @@ With 4 paths a sweep has one bracket, and costs that are dear to compute are not
 leaves the path costs ``L`` of its vertical path in `sums`. The bracket of row y follows from the path costs of the row
 that the path came from, and what is left of ``L`` is the cost (`recover_row`): the volume holds both. The sum over the
 paths is then ``3 * C + L`` and the other three brackets.
+
+Bound and measurement, 4 paths with recovered costs, 1242x375 with 128 levels (931 500 vectors of 64 cells), one thread
+of a Zen 4 that begins two 512-bit operations per cycle of 3.65 GHz (0.13 ms per operation and volume) and moves
+about 10 GB/s beyond its caches (6 ms per volume); operations are those on vectors, loads and stores apart::
+
+                                     operations   bytes        bound     measured
+    vertical path, first visit       12           writes 59.6M  5.6 ms    5.6 ms
+    costs recovered                  11           reads 59.6M   5.6 ms    5.7 ms
+    both paths along the row         26 + 10      caches        4.6 ms    5.4 ms
+    vertical path and sum            33           caches        4.2 ms    8.5 ms
+    selection                        10 + 15      caches        3.2 ms    3.5 ms
+
+The volume lives outside the caches: its two passes are bound by memory, the rest by the arithmetic. The sum stays
+furthest from its bound: widening bytes to words takes half of its operations, on ports that few of them share.
 """
 
 from __future__ import annotations

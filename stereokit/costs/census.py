@@ -5,6 +5,10 @@ match is the number of bits that differ. All neighbours of the window count (62 
 
 The bits are kept as byte planes, eight neighbours to a plane: then the Hamming distances of 64 levels are, plane
 by plane, one load, one exclusive or, one population count and one addition of bytes.
+
+Bound and measurement: 5x5 has 3 planes, so 64 cells take 9 operations on 512-bit vectors, 3 loads and a store, or
+1.2 ms for 1242x375 with 128 levels on one thread of a Zen 4 at two operations per cycle of 3.65 GHz and 1.9 ms for the
+loads and stores; measured 2.5 ms.
 """
 
 from __future__ import annotations

@@ -15,9 +15,12 @@ so the work per cell does not grow with the window. The right pixels of the row 
 lie side by side in one 32-bit lane, and so do their left factors, ``n * new`` and ``-n * old``: one instruction
 (`multiply_pairs`) makes what a column gains, and with the window's own sums in such lanes, what the numerator loses.
 
-Bound for 64 cells (512-bit vectors, 4 to 64 lanes of 32 bits): 8 loads and 4 stores of column sums, 4 multiplications
-with addition and 8 additions that slide, 4 for the numerator, 16 for float conversion, two factors and rounding, and
-about 14 to pack and to turn rho into a cost: some 55 instructions, and 512 bytes to and from the second-level cache.
+Bound and measurement for 64 cells (512-bit vectors): column sums are read twice and written once, and the right
+image's pairs, sums and factors are read once, at any alignment: 8 aligned loads at 0.29 ns, 12 others at 0.44 ns and
+5 stores at 0.54 ns (each measured alone on a Zen 4 at 3.65 GHz) make 10.3 ns. The 47 operations on vectors (8
+multiplications of pairs, 8 additions and subtractions that slide, 16 for conversion, two factors and rounding, 9 to
+pack and to turn rho into a cost, and copies) would take 6.4 ns. Measured: 12.4 ns, 11.6 ms for 1242x375 with 128
+levels on one thread. Memory ports bind, not the arithmetic.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.kernels.jit import kernel
 from stereokit.kernels.pool import run_stages, spans
 from stereokit.kernels.workspace import Workspace
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
@@ -97,7 +96,7 @@ def post_process(
     def clean(y0: int, y1: int) -> None:
         if chain.speckle:
             erase(flat, y0 * width, y1 * width, chain.speckle, label, parent, count)
-        _mark_valid(flat, y0 * width, y1 * width, valid.reshape(-1))
+        np.equal(disparity[y0:y1], disparity[y0:y1], out=valid[y0:y1])  # NaN is not
         if chain.fill is not None and fill_rows(disparity, y0, y1, chain.fill == "nearest"):
             incomplete.append(y0)
 
@@ -121,9 +120,3 @@ def post_process(
             disparity[:] = chain.nothing
         run_stages(stages[-1:], threads)
     return out, valid
-
-
-@kernel
-def _mark_valid(disparity: NDArray[np.float32], start: int, stop: int, out: NDArray[np.bool_]) -> None:
-    for at in range(start, stop):
-        out[at] = disparity[at] == disparity[at]

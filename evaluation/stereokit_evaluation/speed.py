@@ -32,7 +32,7 @@ from stereokit_evaluation._probes import ProbeError, first_call, memory_added, s
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation._rounds import round_robin
 from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
-from stereokit_evaluation._stage_times import stage_times
+from stereokit_evaluation._stage_times import allocated_bytes, stage_times
 from stereokit_evaluation.scenes import generate
 
 __all__ = ["bench", "parse_sizes", "parse_threads"]
@@ -101,6 +101,7 @@ def bench(
                 for name in methods if stages else ():
                     with _opencv_threads(1):
                         findings.stages[size.name, name] = stage_times(name, size.levels, *images, rounds)
+                        findings.allocated[size.name, name] = allocated_bytes(name, size.levels, *images, 1)
                     step(f"{size.name}: stages of {name}")
             if first:
                 size = next((size for size in chosen if size.name == "K"), chosen[0])

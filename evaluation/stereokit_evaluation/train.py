@@ -46,6 +46,7 @@ def train(
     extra: Annotated[
         list[str] | None, typer.Option(metavar="DATASET:ROOT", help="More frames to train on, never held out.")
     ] = None,
+    extra_share: Annotated[float, typer.Option(help="Share of the crops that are of extra frames.")] = 0.2,
     streets: Annotated[int, typer.Option(help="Synthetic streets to train on.")] = 0,
     street_share: Annotated[float, typer.Option(help="Share of the crops that are of streets.")] = 0.5,
     method: Annotated[list[str] | None, typer.Option(help="Matchers; may repeat. Default S1 to S4.")] = None,
@@ -71,10 +72,10 @@ def train(
         raise OptionError("dataset, extra or streets must be given, got none of them")
     if folds is not None and (dataset is None or validation is not None):
         raise OptionError(f"folds must come with a dataset and without validation, got {folds!r}")
-    if not 0 <= street_share <= 1 or streets < 0 or variants < 1:
+    if not (0 <= extra_share and 0 <= street_share and extra_share + street_share <= 1) or streets < 0 or variants < 1:
         raise OptionError(
-            f"street_share must be from 0 to 1, streets at least 0 and variants at least 1, "
-            f"got {street_share:g}, {streets} and {variants}"
+            "street_share and extra_share must be at least 0 and together at most 1, streets at least 0 and variants "
+            f"at least 1, got {street_share:g}, {extra_share:g}, {streets} and {variants}"
         )
     content = None if start is None else read(start)
     if content is not None and content.network != refiner:
@@ -130,11 +131,11 @@ def train(
         scenes = street_samples(step)
     results = []
     for number, (training, held_out) in enumerate(groups):
-        names = [*(frame.name for frame in training), *more]
-        mine = [sample for name in names for sample in maps[name]]
-        sources = [Source(scenes, street_share if mine else 1.0)] if scenes else []
-        if mine:
-            sources.append(Source(mine, 1 - street_share if scenes else 1.0))
+        mine = [sample for frame in training for sample in maps[frame.name]]
+        others = [sample for name in more for sample in maps[name]]
+        rest = 1 - (street_share if scenes else 0.0) - (extra_share if others else 0.0)
+        shares = ((mine, rest), (others, extra_share), (scenes, street_share))
+        sources = [Source(samples, share) for samples, share in shares if samples and share > 0]
         folder = output if folds is None else output / f"fold-{number}"
         where = [(frame.name, name) for frame in held_out for name in methods]
         looked_at = [sample for frame in held_out for sample in truth[frame.name]]

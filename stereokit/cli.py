@@ -11,7 +11,6 @@ Bad input ends with one line, ``error: ...``, on standard error and exit status 
 from __future__ import annotations
 
 import inspect
-import json
 import os
 import platform
 import sys
@@ -28,6 +27,8 @@ from rich.console import Console
 from rich.table import Table
 from typer.core import TyperGroup
 
+from stereokit import commandline
+from stereokit.commandline import JsonOption
 from stereokit.errors import InputError, OptionError, StereokitError
 
 if TYPE_CHECKING:
@@ -39,9 +40,6 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 _GROUP = "stereokit.commands"
-_OWN_OPTIONS = frozenset(  # not through --set
-    "method max_disparity min_disparity scale refiner fill threads device right confidence".split()
-)
 _STAGES = {
     "census": "Census cost",
     "zncc": "ZNCC cost",
@@ -88,9 +86,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-JsonOption = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - prints it.")
-]
 
 
 def main() -> None:
@@ -168,11 +163,11 @@ def match(
         io.check_output(path, suffixes[name], name)
         if name in ("--output", "--right") and path.suffix.lower() == ".png":
             _check_fits_png(name, min_disparity, max_disparity)
-    outputs.update(_check_json(json_file))
+    outputs.update(commandline.check_json(json_file))
     _check_distinct({"LEFT": left, "RIGHT": right_image, "--calibration": calibration}, outputs)
     if (ply is None) != (calibration is None):
         raise OptionError("--ply and --calibration go together, got only one of them")
-    options = _parse_settings(settings or [])
+    options = commandline.parse_settings(settings or [])
     wanted = {"fill": fill, "right": right and True, "confidence": confidence and True}
     options.update({name: value for name, value in wanted.items() if value is not None})
 
@@ -243,7 +238,7 @@ def match(
 @app.command("list")
 def list_(json_file: JsonOption = None) -> None:
     """List the methods and the stages they are made of."""
-    _check_json(json_file)
+    commandline.check_json(json_file)
     from stereokit.matching import METHODS
     from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 
@@ -264,7 +259,7 @@ def list_(json_file: JsonOption = None) -> None:
 @app.command()
 def info(json_file: JsonOption = None) -> None:
     """Show versions, processor, threads and devices, for bug reports."""
-    _check_json(json_file)
+    commandline.check_json(json_file)
     import cv2
     import llvmlite.binding
     import numba
@@ -333,14 +328,6 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _check_json(path: Path | None) -> dict[str, Path]:
-    if path is None or str(path) == "-":
-        return {}
-    from stereokit import io
-
-    return {"--json": io.check_output(path, name="--json")}
-
-
 def _check_fits_png(name: str, min_disparity: int, max_disparity: int) -> None:
     if min_disparity < 0 or max_disparity > 256:
         span = f"{min_disparity} .. {max_disparity}"
@@ -353,31 +340,6 @@ def _check_distinct(inputs: dict[str, Path | None], outputs: dict[str, Path]) ->
         other = taken.setdefault(os.path.realpath(path), name)
         if other != name:
             raise OptionError(f"{name} and {other} must be different files, got {str(path)!r} for both")
-
-
-def _parse_settings(settings: list[str]) -> dict[str, Any]:
-    options: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        key = key.strip().replace("-", "_")
-        if not equals or not key.isidentifier():
-            raise OptionError(f"--set must be KEY=VALUE, got {setting!r}")
-        if key in _OWN_OPTIONS:
-            raise OptionError(f"--set {key}: use --{key.replace('_', '-')} instead")
-        if key in options:
-            raise OptionError(f"--set {key} must be given once, got it twice")
-        options[key] = _parse_value(text.strip())
-    return options
-
-
-def _parse_value(text: str) -> int | float | bool | str | None:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    words = {"true": True, "false": False, "none": None}
-    return words[text.lower()] if text.lower() in words else text
 
 
 def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height: int) -> Calibration | None:
@@ -422,14 +384,8 @@ def _write_cloud(path: Path, result: Disparity, camera: Calibration, image: NDAr
 
 
 def _report(content: dict[str, Any], tables: list[Table], path: Path | None) -> None:
-    text = json.dumps(content, indent=2) + "\n"
-    if path is not None and str(path) == "-":
-        typer.echo(text, nl=False)
+    if commandline.write_json(path, content):
         return
-    if path is not None:
-        from stereokit import io
-
-        io.write_bytes(path, text.encode("utf-8"))
     console = Console()
     for table in tables:
         console.print(table)

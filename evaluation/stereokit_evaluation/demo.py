@@ -6,7 +6,6 @@ of the KITTI 2015 development kit, on one image. `overview` draws the picture fr
 
 from __future__ import annotations
 
-import json
 import re
 import statistics
 import sys
@@ -24,11 +23,13 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from stereokit.commandline import JsonOption, check_json, write_json
 from stereokit.errors import FileError, InputError, OptionError
-from stereokit.io import write_bytes, write_image
+from stereokit.io import write_image
 from stereokit.result import colorize
 from stereokit_evaluation.errormap import error_map
-from stereokit_evaluation.metrics import Regions, Score, score
+from stereokit_evaluation.figures import d1
+from stereokit_evaluation.metrics import Score, score
 from stereokit_evaluation.scenes import Scene, generate
 
 __all__ = ["Panel", "demo", "overview"]
@@ -140,9 +141,7 @@ def demo(
         list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat. Default: S1 to S4.")
     ] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them.")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Match a synthetic street with every method, score it against the exact truth, and draw the results."""
     width, height = _parse_size(size)
@@ -172,12 +171,8 @@ def demo(
     _make_folder(output)
     _write_pictures(output, scene, outcomes)
     document = {"results": [_as_json(outcome) for outcome in outcomes]}
-    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
-    if str(json_file) == "-":
-        typer.echo(text, nl=False)
+    if write_json(json_file, document):
         return
-    if json_file is not None:
-        write_bytes(json_file, text.encode())
     _print_table(f"synthetic street {seed}, {width}x{height}, {max_disparity} disparities", outcomes)
     typer.echo(f"pictures in {output}, all at once in {output / 'overview.png'}")
 
@@ -191,8 +186,7 @@ def _parse_size(size: str) -> tuple[int, int]:
 
 def _check_places(output: Path, json_file: Path | None) -> None:
     """Refuse what cannot be written before any work is done."""
-    if json_file is not None and str(json_file) != "-" and (json_file.is_dir() or not json_file.parent.is_dir()):
-        raise FileError(f"json must name a file in an existing folder, got {str(json_file)!r}")
+    check_json(json_file)
     nearest = next(place for place in (output, *output.absolute().parents) if place.exists())
     if not nearest.is_dir():
         raise FileError(f"output must be a folder, got {str(output)!r} ({str(nearest)!r} is a file)")
@@ -244,12 +238,8 @@ def _as_json(outcome: _Outcome) -> dict[str, Any]:
         "refiner": None,
         "device": outcome.device,
         "images": 1,
-        "d1": {"noc": _d1(outcome.score.noc), "occ": _d1(outcome.score.occ)},
+        "d1": {"noc": d1(outcome.score.noc), "occ": d1(outcome.score.occ)},
         "epe": main.filled.epe(),
         "density": main.density(),
         "seconds_per_image": outcome.seconds,
     }
-
-
-def _d1(regions: Regions) -> dict[str, float | None]:
-    return {name: getattr(regions, name).filled.d1() for name in ("all", "bg", "fg")}

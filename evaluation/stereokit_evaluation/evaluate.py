@@ -6,14 +6,9 @@ column counts only the images that have its ground truth. For scripts there is `
 
 from __future__ import annotations
 
-import json
-import math
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,15 +16,17 @@ import typer
 from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from stereokit import __version__
+from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
 from stereokit.errors import FileError, OptionError
-from stereokit.io import write_bytes, write_image
+from stereokit.io import write_image
+from stereokit_evaluation._progress import progress
 from stereokit_evaluation.datasets import load, select
 from stereokit_evaluation.errormap import error_map
+from stereokit_evaluation.figures import figures
 from stereokit_evaluation.frames import Frame
-from stereokit_evaluation.metrics import THRESHOLDS, Regions, Tally
 from stereokit_evaluation.runner import (
     Estimate,
     Estimator,
@@ -46,7 +43,6 @@ __all__ = ["Result", "evaluate", "run"]
 
 _DEFAULT_METHOD = "zncc+sgm"
 _DEFAULT_DISPARITIES = 128
-_BAR_AFTER_S = 1.0
 _OWN_OPTIONS = frozenset(("method", "scale", "refiner", "device", "threads", "max_disparity"))
 
 
@@ -76,15 +72,13 @@ def evaluate(
     color: Annotated[bool, typer.Option("--color/--gray", help="Images as stored, or grey.")] = False,
     count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
     error_maps: Annotated[Path | None, typer.Option(help="Write error maps to METHOD/NAME.png here.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them.")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Score matching methods, or finished disparity maps, against ground truth as KITTI 2015 does.
 
     Frames that cannot be read are named on standard error and left out; the exit status is then 1.
     """
-    _check_json(json_file)
+    check_json(json_file)
     chosen = select(load(dataset, root, count=count), frames)
     options: dict[str, Any]
     if predictions is not None:
@@ -98,7 +92,7 @@ def evaluate(
         suggested = [frame.max_disparity for frame in chosen if frame.max_disparity is not None]
         if max_disparity is None:
             max_disparity = max(suggested, default=_DEFAULT_DISPARITIES)
-        options = {"max_disparity": max_disparity, "threads": threads, **_parse(settings or ())}
+        options = {"max_disparity": max_disparity, "threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
         methods = method or [_DEFAULT_METHOD]
         runs = [_matcher_run(name, scale, refiner, device, options, color) for name in methods]
     results, interrupted = _execute(runs, chosen, error_maps)
@@ -109,51 +103,14 @@ def evaluate(
         "options": {**options, "color": color, "frames": frames},
         "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in skipped],
         "interrupted": interrupted,
-        "version": _version(),
+        "version": __version__,
     }
-    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
-    if str(json_file) == "-":
-        typer.echo(text, nl=False)
-    else:
-        if json_file is not None:
-            write_bytes(json_file, text.encode())
+    if not write_json(json_file, document):
         _print_table(f"{dataset}, {len(chosen)} frames", runs, results)
     if interrupted:
         raise typer.Exit(130)
     if skipped:
         raise typer.Exit(1)
-
-
-def _check_json(path: Path | None) -> None:
-    if path is None or str(path) == "-":
-        return
-    if path.is_dir() or not path.parent.is_dir():
-        raise FileError(f"json must name a file in an existing folder, got {str(path)!r}")
-
-
-def _parse(pairs: Sequence[str]) -> dict[str, Any]:
-    options: dict[str, Any] = {}
-    for pair in pairs:
-        key, equals, text = pair.partition("=")
-        key = key.strip().replace("-", "_")
-        if not equals or not key.isidentifier():
-            raise OptionError(f"set must be key=value, got {pair!r}")
-        if key in _OWN_OPTIONS:
-            raise OptionError(f"set must not hold {key}, which has an option of its own, got {pair!r}")
-        options[key] = _value(text.strip())
-    return options
-
-
-def _value(text: str) -> int | float | bool | str | None:
-    for kind in (int, float):
-        try:
-            value = kind(text)
-        except ValueError:
-            continue
-        if math.isfinite(value):
-            return value
-    words = {"true": True, "false": False, "none": None}
-    return words.get(text.lower(), text)
 
 
 def _matcher_run(
@@ -170,7 +127,7 @@ def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -
     """Run all, printing skipped frames as they come; an interrupt ends the work and keeps what was done."""
     results: list[Result] = []
     told: set[Skipped] = set()
-    with _progress(len(runs) * len(frames)) as (console, step):
+    with progress(len(runs) * len(frames)) as (console, step):
         for job in runs:
             scored: list[Scored] = []
             skipped: list[Skipped] = []
@@ -191,26 +148,6 @@ def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -
                 return [*results, Result(tuple(scored), tuple(skipped))], True
             results.append(Result(tuple(scored), tuple(skipped)))
     return results, False
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[tuple[Console, Callable[[str], None]]]:
-    """Show a bar on the terminal's error stream once the work has taken over a second."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    task = bar.add_task("", total=total)
-    begun = time.monotonic()
-
-    def step(text: str) -> None:
-        bar.update(task, advance=1, description=text)
-        if time.monotonic() - begun > _BAR_AFTER_S and not bar.live.is_started:
-            bar.start()
-
-    try:
-        yield console, step
-    finally:
-        bar.stop()
 
 
 def _draws(folder: Path) -> Callable[..., None]:
@@ -258,49 +195,6 @@ def _half(scale: float | None) -> str:
 
 
 def _as_json(job: _Run, result: Result) -> dict[str, Any]:
-    """Return one entry of ``results``: percent and pixels, pooled; None where ground truth is missing."""
-    pooled = result.score
-    return {
-        "method": job.method,
-        "scale": job.scale,
-        "refiner": job.refiner,
-        "device": job.device,
-        "images": len(result.frames),
-        "d1": {"noc": _d1(pooled.noc), "occ": _d1(pooled.occ)},
-        "epe": pooled.main.filled.epe(),
-        "density": pooled.main.density(),
-        "seconds_per_image": result.seconds_per_image,
-        "bad": {"noc": _bad(pooled.noc.all.filled), "occ": _bad(pooled.occ.all.filled)},
-        "est": {
-            "d1": {"noc": _d1(pooled.noc, est=True), "occ": _d1(pooled.occ, est=True)},
-            "bad": {"noc": _bad(pooled.noc.all.measured), "occ": _bad(pooled.occ.all.measured)},
-            "epe": pooled.main.measured.epe(),
-        },
-        "pixels": {"noc": pooled.noc.all.filled.pixels, "occ": pooled.occ.all.filled.pixels},
-        "frames": [
-            {
-                "name": frame.name,
-                "d1": {"noc": frame.score.noc.all.filled.d1(), "occ": frame.score.occ.all.filled.d1()},
-                "epe": frame.score.main.filled.epe(),
-                "seconds": frame.seconds,
-            }
-            for frame in result.frames
-        ],
-        "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in result.skipped],
-    }
-
-
-def _d1(regions: Regions, *, est: bool = False) -> dict[str, float | None]:
-    parts = {"all": regions.all, "bg": regions.bg, "fg": regions.fg}
-    return {name: (part.measured if est else part.filled).d1() for name, part in parts.items()}
-
-
-def _bad(tally: Tally) -> dict[str, float | None]:
-    return {f"{x:g}": tally.bad_x(x) for x in THRESHOLDS}
-
-
-def _version() -> str | None:
-    try:
-        return version("stereokit")
-    except PackageNotFoundError:
-        return None
+    """Return one entry of ``results``."""
+    described = {"method": job.method, "scale": job.scale, "refiner": job.refiner, "device": job.device}
+    return {**described, **figures(result)}

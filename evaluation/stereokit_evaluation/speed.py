@@ -10,10 +10,7 @@ OpenCV's SGBM and HH modes hardly use a second thread; they are reported for eve
 
 from __future__ import annotations
 
-import json
-import math
 import re
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,15 +21,15 @@ import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from stereokit.commandline import JsonOption, check_json, write_json
 from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
-from stereokit.io import check_output, read_image, write_bytes
+from stereokit.io import read_image
 from stereokit.methods import parse_method
 from stereokit_evaluation._peers import PEERS, Call, label, make, peers
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
+from stereokit_evaluation._progress import progress
 from stereokit_evaluation._rounds import round_robin
 from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
 from stereokit_evaluation._stage_times import stage_times
@@ -40,7 +37,6 @@ from stereokit_evaluation.scenes import generate
 
 __all__ = ["bench", "parse_sizes", "parse_threads"]
 
-_BAR_AFTER_S = 1.0
 _FIRST_CALLS = 3
 _MEMORY_SIZES = ("K", "M")
 _MOST_LEVELS = 2048
@@ -69,9 +65,7 @@ def bench(
     first: Annotated[
         bool, typer.Option("--first-call/--no-first-call", help="Time of the first call in a new process.")
     ] = True,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to this file; - prints them.")
-    ] = None,
+    json_file: JsonOption = None,
 ) -> None:
     """Time our methods against other libraries: median, quartiles, memory.
 
@@ -82,8 +76,7 @@ def bench(
     chosen, counts = parse_sizes(sizes), parse_threads(threads)
     if rounds < 1:
         raise OptionError(f"rounds must be at least 1, got {rounds}")
-    if json_file is not None and str(json_file) != "-":
-        check_output(json_file, name="json")
+    check_json(json_file)
     if (left is None) != (right is None):
         raise OptionError("left and right go together, got only one of them")
     pictures = None if left is None or right is None else (_read(left), _read(right))
@@ -96,7 +89,7 @@ def bench(
     steps = len(chosen) * len(counts) * len(contenders) * (1 + rounds) + len(weighed) * len(contenders)
     steps += len(methods) * (stages * len(chosen) + first)
     findings = Findings(methods=methods, sizes=chosen, threads=counts, rounds=rounds)
-    with _progress(steps) as (console, step):
+    with progress(steps) as (console, step):
         try:
             for size in chosen:
                 step(f"{size.name}: images", 0)
@@ -120,12 +113,7 @@ def bench(
         "peers": with_peers, "memory": [size.name for size in weighed], "stages": stages,
         "images": "synthetic" if left is None else [str(left), str(right)],
     }  # fmt: skip
-    text = json.dumps(as_json(findings, options), indent=2, allow_nan=False) + "\n"
-    if str(json_file) == "-":
-        typer.echo(text, nl=False)
-    else:
-        if json_file is not None:
-            write_bytes(json_file, text.encode())
+    if not write_json(json_file, as_json(findings, options)):
         print_tables(findings)
     if findings.interrupted:
         raise typer.Exit(130)
@@ -276,28 +264,3 @@ def _opencv_threads(threads: int) -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[tuple[Console, Callable[..., None]]]:
-    """Show a bar on standard error after the first second; it is drawn between calls only, never during one."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not console.is_terminal)
-    task = bar.add_task("", total=total)
-    begun, shown = time.monotonic(), -math.inf
-
-    def step(text: str, advance: int = 1) -> None:
-        nonlocal shown
-        bar.update(task, advance=advance, description=text)
-        now = time.monotonic()
-        if now - begun > _BAR_AFTER_S and now - shown > 0.2:
-            shown = now
-            if not bar.live.is_started:
-                bar.start()
-            bar.refresh()
-
-    try:
-        yield console, step
-    finally:
-        bar.stop()

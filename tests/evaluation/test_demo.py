@@ -88,7 +88,7 @@ def test_bad_places_and_methods_are_refused_before_any_work(stand_in, tmp_path):
     taken.write_text("mine")
     with pytest.raises(FileError, match="output must be a folder"):
         demo(taken)
-    with pytest.raises(FileError, match="json must name a file"):
+    with pytest.raises(FileError, match="--json"):
         demo(tmp_path / "out", json_file=tmp_path / "none" / "x.json")
     with pytest.raises(OptionError, match="nonsense"):
         demo(tmp_path, method=["nonsense"])

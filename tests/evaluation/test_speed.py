@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from stereokit import matching
 from stereokit.cli import app
 from stereokit.errors import OptionError, StereokitError, UnknownNameError
-from stereokit_evaluation import _peers, _speed_report, speed
+from stereokit_evaluation import _peers, _progress, _speed_report, speed
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._rounds import ratio, round_robin, spread
 from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
@@ -404,10 +404,10 @@ def test_progress_is_drawn_between_calls_only(monkeypatch):
             self.refreshed += 1
             made.append(self.refreshed)
 
-    monkeypatch.setattr(speed, "Progress", Bar)
+    monkeypatch.setattr(_progress, "Progress", Bar)
     now = iter([0.0, 0.5, 1.5, 1.6])
-    monkeypatch.setattr(speed.time, "monotonic", lambda: next(now))
-    with speed._progress(3) as (_, step):
+    monkeypatch.setattr(_progress.time, "monotonic", lambda: next(now))
+    with _progress.progress(3) as (_, step):
         for _ in range(3):
             step("one")
     assert made[0]["auto_refresh"] is False

@@ -23,7 +23,7 @@ from stereokit.kernels.simd import vector_bits
 from stereokit_evaluation._peers import HH, PEERS, THREE_WAY, label, usable_levels
 from stereokit_evaluation._rounds import Spread, ratio, spread
 
-__all__ = ["SIZES", "Findings", "Size", "as_json", "print_tables"]
+__all__ = ["SIZES", "Findings", "Size", "as_json", "machine", "print_tables", "versions"]
 
 
 @dataclass(frozen=True)
@@ -148,14 +148,19 @@ def as_json(findings: Findings, options: dict[str, Any]) -> dict[str, Any]:
         },
         "options": options,
         "interrupted": findings.interrupted,
-        "versions": _versions(),
-        "machine": {
-            "cpu": _cpu_name(),
-            "processors": available_threads(),
-            "vector_bits": vector_bits(),
-            "system": f"{platform.system()} {platform.machine()}",
-            "load": findings.load,
-        },
+        "versions": versions(),
+        "machine": machine(findings.load),
+    }
+
+
+def machine(load: list[float] | None = None) -> dict[str, Any]:
+    """Return what times depend on: processor, number of processors, vector width, system, and the given load."""
+    return {
+        "cpu": _cpu_name(),
+        "processors": available_threads(),
+        "vector_bits": vector_bits(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "load": load,
     }
 
 
@@ -181,11 +186,11 @@ def print_tables(findings: Findings) -> None:
     for skip in findings.skipped:
         line = f"left out: {skip['contender']}, {skip['size']}, {_threads(skip['threads'])}: {skip['reason']}"
         console.print(line, markup=False, highlight=False)
-    versions = ", ".join(f"{name} {number}" for name, number in _versions().items() if number)
+    numbers = ", ".join(f"{name} {number}" for name, number in versions().items() if number)
     load = "" if findings.load is None else f", load {findings.load[0]:.1f} at the start"
-    machine = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{load}"
-    console.print(machine, markup=False, highlight=False)
-    console.print(versions, highlight=False)
+    place = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{load}"
+    console.print(place, markup=False, highlight=False)
+    console.print(numbers, highlight=False)
 
 
 def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> Table:
@@ -260,7 +265,8 @@ def _share(findings: Findings, size: str, key: str) -> float | None:
     return ours / theirs if ours is not None and theirs else None
 
 
-def _versions() -> dict[str, str | None]:
+def versions() -> dict[str, str | None]:
+    """Return the versions of this package and of those that times depend on."""
     found: dict[str, str | None] = {name: _version(name) for name in ("stereokit", "numba", "numpy")}
     found |= {"opencv": cv2.__version__, "python": platform.python_version()}
     others = {peer.module for peer in PEERS.values()} - {"cv2"}

@@ -11,8 +11,7 @@ OpenCV's SGBM and HH modes hardly use a second thread; they are reported for eve
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Annotated
@@ -27,7 +26,7 @@ from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
 from stereokit.io import read_image
 from stereokit.methods import parse_method
-from stereokit_evaluation._peers import PEERS, Call, label, make, peers
+from stereokit_evaluation._peers import PEERS, Call, label, make, opencv_threads, peers
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation._rounds import round_robin
@@ -99,7 +98,7 @@ def bench(
                 if size in weighed:
                     _weigh(size, max(counts), contenders, images, findings, step)
                 for name in methods if stages else ():
-                    with _opencv_threads(1):
+                    with opencv_threads(1):
                         findings.stages[size.name, name] = stage_times(name, size.levels, *images, rounds)
                     step(f"{size.name}: stages of {name}")
             if first:
@@ -183,7 +182,7 @@ def _time(
 ) -> None:
     """Warm everyone up, then time them in turns; the seconds go to ``findings.times``."""
     calls: dict[str, Call] = {}
-    with _opencv_threads(threads):
+    with opencv_threads(threads):
         for key in contenders:
             step(f"{size.name}, {threads} threads: {label(key)}, first call")
             reason = _too_large(key, size)
@@ -254,13 +253,3 @@ def _free_bytes() -> float | None:
     except OSError:
         pass
     return None
-
-
-@contextmanager
-def _opencv_threads(threads: int) -> Iterator[None]:
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(threads)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

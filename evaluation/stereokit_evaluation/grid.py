@@ -1,0 +1,234 @@
+"""The grid of the robustness study: matchers times settings, each with all that its results depend on.
+
+Settings are those of the StereoVAE paper, section "Robustness": *Original* matches at full size; *Mini+X* matches at
+half size and lets the refiner X bring the map to full size. *Mini+CNN* is the paper's network without the latent
+sampling ("non-VAE" in its table II). Any other registered refiner joins as a further setting.
+
+A refiner that is not installed, or whose runtime is not, leaves its configurations in the grid with the reason.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+import stereokit
+from stereokit.errors import OptionError, UnknownNameError, did_you_mean
+from stereokit.matching import METHODS, Matcher
+from stereokit.methods import option_names, parse_method
+from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
+from stereokit_evaluation import _peers
+from stereokit_evaluation.runner import Matching
+
+__all__ = [
+    "PAPER_SETTINGS",
+    "PEER",
+    "Configuration",
+    "build",
+    "describe_error",
+    "fingerprint",
+    "parse_setting",
+    "peer",
+    "settings_at_hand",
+    "title",
+]
+
+PAPER_SETTINGS = {"linear": "Mini+Linear", "original": "Original", "cnn": "Mini+CNN", "stereovae": "Mini+StereoVAE"}
+"""The paper's settings, by the names that ``--setting`` takes."""
+PEER = "peer"
+"""The setting of another library's matcher."""
+
+Factories = Mapping[tuple[str, str], Callable[[], Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Configuration:
+    """One cell of the grid.
+
+    Attributes
+    ----------
+    method : str
+        ``"zncc+sgm"``, or a peer's name.
+    label : str
+        ``"S4"``, or the method where it has no short name.
+    setting : str
+        A key of `PAPER_SETTINGS`, another refiner's name, or `PEER`.
+    matcher : callable or None
+        What is called; None if it cannot be built.
+    identity : dict
+        All that its maps depend on beside the images: resolved options, weights, source.
+    missing : str or None
+        Why it cannot be built, in one line.
+    """
+
+    method: str
+    label: str
+    setting: str
+    matcher: Matching | None = None
+    identity: dict[str, Any] = field(default_factory=dict)
+    missing: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Its name for people: ``"S4 Mini+Linear"``."""
+        return self.label if self.setting == PEER else f"{self.label} {title(self.setting)}"
+
+    @property
+    def scale(self) -> float:
+        """The size at which it matches."""
+        return 1.0 if self.setting in ("original", PEER) else 0.5
+
+
+def title(setting: str) -> str:
+    """Return what tables call a setting: ``"Mini+CNN"``."""
+    return PAPER_SETTINGS.get(setting) or f"Mini+{setting}"
+
+
+def settings_at_hand() -> list[str]:
+    """Return the paper's settings and one for each further refiner that is registered."""
+    return [*PAPER_SETTINGS, *(name for name in REFINERS.names() if name not in PAPER_SETTINGS)]
+
+
+def parse_setting(text: str) -> str:
+    """Return the setting called `text`: ``"original"``, a refiner, or ``"Mini+REFINER"``, in any case.
+
+    Raises
+    ------
+    UnknownNameError
+        If the paper has no such setting and no such refiner is registered.
+    """
+    known = settings_at_hand()
+    name = text.strip().lower().removeprefix("mini+")
+    if name not in known:
+        raise UnknownNameError(did_you_mean("setting", text, known))
+    return name
+
+
+def build(
+    methods: Sequence[str],
+    settings: Sequence[str],
+    options: Mapping[str, Any],
+    factories: Factories | None = None,
+) -> list[Configuration]:
+    """Return the grid, matcher by matcher, in the order given.
+
+    Parameters
+    ----------
+    methods : sequence of str
+        Methods, in any of their forms.
+    settings : sequence of str
+        As `parse_setting` returns them.
+    options : mapping
+        Options of `stereokit.Matcher`. An option of a stage goes to the methods that have this stage only.
+    factories : mapping, optional
+        Refiners that were trained for one method: (method, setting) to a function that builds the refiner.
+
+    Raises
+    ------
+    OptionError
+        If no chosen method knows an option, or one refuses its value.
+    """
+    names = list(dict.fromkeys(parse_method(method) for method in methods))
+    for option in options:
+        if all(option in _foreign(name) for name in names):
+            raise OptionError(f"option {option!r} must belong to a chosen method, got {', '.join(names)}")
+    return [
+        _configure(name, setting, {k: v for k, v in options.items() if k not in _foreign(name)}, factories or {})
+        for name in names
+        for setting in dict.fromkeys(settings)
+    ]
+
+
+def peer(key: str, levels: int) -> Configuration:
+    """Return another library's matcher as a configuration: `key` is one of `stereokit_evaluation._peers`."""
+    identity = {"peer": key, "levels": levels, "opencv": cv2.__version__, "source": fingerprint(Path(_peers.__file__))}
+    return Configuration(key, key, PEER, _peers.padded(key, levels), identity)
+
+
+@cache
+def fingerprint(place: Path, *, everything: bool = False) -> str:
+    """Return a digest of a file, or of the Python source below a folder.
+
+    Parameters
+    ----------
+    place : Path
+        A file or a folder; it is read once in a process.
+    everything : bool
+        Read all files of the folder, such as weights, but compiled ones.
+    """
+    digest = hashlib.sha256()
+    for path in [place] if place.is_file() else sorted(place.rglob("*" if everything else "*.py")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            digest.update(path.relative_to(place).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def describe_error(error: BaseException) -> str:
+    """Return an error in one line: those of other libraries with their type, a missing package by its name."""
+    text = " ".join(str(error).split())
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        return f"needs the package {error.name!r}, which is not installed"
+    return text if isinstance(error, stereokit.StereokitError) else f"{type(error).__name__}: {text}".rstrip(": ")
+
+
+def _configure(method: str, setting: str, options: dict[str, Any], factories: Factories) -> Configuration:
+    label = next((short for short, name in METHODS.items() if name == method), method)
+    if setting == "original":
+        matcher = Matcher(method, **options)
+        return Configuration(method, label, setting, matcher, _identity(matcher, None))
+    Matcher(method, scale=0.5, **options)  # a bad option is the user's, and no reason to call a refiner missing
+    name = setting
+    if (factory := factories.get((method, setting))) is not None:
+        name = f"{setting}@{method.replace('+', '-')}"
+        if name not in REFINERS.names():
+            REFINERS.register(name)(factory)
+    elif setting not in REFINERS.names():
+        return Configuration(method, label, setting, missing=f"no refiner named {setting!r} is installed")
+    try:
+        matcher = Matcher(method, scale=0.5, refiner=name, **options)
+        return Configuration(method, label, setting, matcher, _identity(matcher, name))
+    except Exception as error:  # a plug-in's own trouble: weights or a runtime that are not there
+        return Configuration(method, label, setting, missing=describe_error(error))
+
+
+def _identity(matcher: Matcher, refiner: str | None) -> dict[str, Any]:
+    options = {name: _stable(value) for name, value in sorted(vars(matcher).items()) if not name.startswith("_")}
+    for name in ("threads", "refiner"):  # the map does not depend on threads; the refiner follows
+        options.pop(name, None)
+    return {
+        "options": options,
+        "source": fingerprint(Path(stereokit.__file__).parent),
+        "refiner": None if refiner is None else _weights(vars(matcher).get("_refine"), refiner),
+    }
+
+
+def _weights(refiner: Any, name: str) -> dict[str, str]:
+    """Return what tells one refiner from another: its own fingerprint or its looks, and the files that it came in."""
+    given = getattr(refiner, "fingerprint", None)
+    given = given() if callable(given) else given
+    module = sys.modules.get(type(refiner).__module__.partition(".")[0])
+    home = inspect.getsourcefile(module) if module is not None and getattr(module, "__file__", None) else None
+    source = fingerprint(Path(home).parent, everything=given is None) if home else ""
+    return {"name": name, "weights": _stable(refiner) if given is None else str(given), "source": source}
+
+
+def _stable(value: Any) -> str:
+    """Return ``repr`` without addresses, which differ from run to run."""
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
+
+
+def _foreign(method: str) -> set[str]:
+    """Return the names of options that only stages of other methods have."""
+    cost, aggregation = method.split("+")
+    stages = [COSTS.get(name) for name in COSTS.names()] + [AGGREGATIONS.get(name) for name in AGGREGATIONS.names()]
+    own = {*option_names(COSTS.get(cost)), *option_names(AGGREGATIONS.get(aggregation))}
+    return {name for stage in stages for name in option_names(stage)} - own

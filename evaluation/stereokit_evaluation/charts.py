@@ -26,6 +26,7 @@ REGIONS = {
 
 _COLOURS = {"linear": "#56b4e9", "original": "#e69f00", "cnn": "#009e73", "stereovae": "#d55e00"}
 _OTHERS = ("#cc79a7", "#0072b2", "#f0e442")
+_TICKS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000]
 _PEER_COLOUR = "#8a8a8a"
 
 Row = Mapping[str, Any]
@@ -106,7 +107,7 @@ def accuracy_time(rows: Sequence[Row]) -> dict[str, Any]:
         values.append(x)
     layout = {
         "xaxis": {"title": {"text": "D1 error, %"}, "rangemode": "tozero"},
-        "yaxis": {"title": {"text": "time, ms"}, "type": "log", "dtick": "D2"},
+        "yaxis": {"title": {"text": "time, ms"}, "type": "log", "tickvals": _TICKS, "ticktext": _TICKS},
         "legend": {"orientation": "h", "y": -0.2},
     }
     return {"data": traces, "layout": layout, "variants": {"x": variants}}
@@ -114,7 +115,8 @@ def accuracy_time(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _bar(name: str, x: Sequence[str], y: Sequence[float | None], marker: dict[str, Any]) -> dict[str, Any]:
     hover = "%{x}: %{y:.2f} %<extra>" + name + "</extra>"
-    labels = {"texttemplate": "%{y:.1f}", "textposition": "outside", "textangle": 0, "cliponaxis": False}
+    labels = {"texttemplate": "%{y:.2~f}", "textposition": "outside", "textangle": -90, "cliponaxis": False}
+    labels |= {"textfont": {"size": 11}, "constraintext": "none"}
     return {"type": "bar", "name": name, "x": list(x), "y": list(y), "marker": marker, "hovertemplate": hover, **labels}
 
 

@@ -62,7 +62,7 @@ def study(
         Path, typer.Option("--output", "-o", metavar="DIR", help="Results are kept here; a later run goes on.")
     ] = Path("study"),
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html to the folder.")] = True,
-    show: Annotated[int, typer.Option(help="Frames to look at in the report.")] = 4,
+    show: Annotated[int, typer.Option(help="Frames to look at in the report.")] = 3,
     json_file: JsonOption = None,
 ) -> None:
     """Run the robustness study: S1 to S4 with every refiner, beside the published figures.

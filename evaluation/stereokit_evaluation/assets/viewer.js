@@ -64,6 +64,7 @@ const Viewer = (() => {
         for (const canvas of Object.values(canvases)) Object.assign(canvas, { width: pair.width, height: pair.height });
       }
       Object.assign(state, { pair, a, b });
+      root.querySelector(".views").classList.toggle("tall", pair.width < 2.2 * pair.height);
       root.querySelectorAll("[data-needs-truth]").forEach((e) => (e.hidden = !pair.truthValues));
       get("top").textContent = `${pair.top.toFixed(0)} px`;
       const step = [...controls.frame.options].findIndex((o) => o.selected);
@@ -123,21 +124,23 @@ const Viewer = (() => {
       const { pair, x, y } = state;
       const i = y * pair.width + x;
       const truth = pair.truthValues ? pair.truthValues[i] : NaN;
+      const hidden = pair.seenValues && Number.isFinite(truth) && !pair.seenValues[i] ? "occluded" : "";
       const row = (name, d, how) => {
         const e = how === null ? NaN : Math.abs(d - truth);
         const bad = e > rules.error.pixels && e / truth > rules.error.share;
-        const cells = [text(d, 2, " px"), text(depth(d), 2, " m"), how === null ? "" : text(e, 2, " px") + (bad ? " ✗" : ""), how ?? ""];
-        return `<tr><th scope="row">${name.replace(/[<&]/g, "")}</th>${cells.map((c) => `<td>${c}</td>`).join("")}</tr>`;
+        const error = how === null ? "" : text(e, 2, " px") + (bad ? " ✗" : "");
+        const tr = document.createElement("tr");
+        const th = Object.assign(document.createElement("th"), { scope: "row", textContent: name });
+        const cells = [text(d, 2, " px"), text(depth(d), 2, " m"), error, how ?? hidden];
+        tr.append(th, ...cells.map((c) => Object.assign(document.createElement("td"), { textContent: c })));
+        return tr;
       };
-      const how = (m) => (m.measured[i] ? "measured" : "filled");
+      const how = (m) => (m.measured[i] ? "" : "filled");
       const rows = [row(state.a.name, state.a.values[i], how(state.a))];
       if (state.b !== state.a) rows.push(row(state.b.name, state.b.values[i], how(state.b)));
-      if (pair.truthValues) {
-        const hidden = pair.seenValues && Number.isFinite(truth) && !pair.seenValues[i] ? "occluded" : "";
-        rows.push(row("true", truth, null).replace(/<td><\/td><\/tr>$/, `<td>${hidden}</td></tr>`));
-      }
+      if (pair.truthValues) rows.push(row("true", truth, null));
       get("position").textContent = `x ${x}, y ${y}`;
-      get("values").innerHTML = rows.join("");
+      get("values").replaceChildren(...rows);
     }
 
     function points() {

@@ -23,7 +23,18 @@ from stereokit.kernels.simd import vector_bits
 from stereokit_evaluation._peers import HH, PEERS, THREE_WAY, label, usable_levels
 from stereokit_evaluation._rounds import Spread, ratio, spread
 
-__all__ = ["SIZES", "Findings", "Size", "as_json", "machine", "print_tables", "versions"]
+__all__ = [
+    "SIZES",
+    "Findings",
+    "Size",
+    "as_json",
+    "format_ms",
+    "load",
+    "machine",
+    "new_table",
+    "print_tables",
+    "versions",
+]
 
 
 @dataclass(frozen=True)
@@ -82,7 +93,7 @@ class Findings:
     stages: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
     skipped: list[dict[str, Any]] = field(default_factory=list)
     interrupted: bool = False
-    load: list[float] | None = field(default_factory=lambda: _load())
+    load: list[float] | None = field(default_factory=lambda: load())
 
     def skip(self, size: Size, contender: str, threads: int, reason: str) -> None:
         """Note that a contender was left out."""
@@ -153,14 +164,14 @@ def as_json(findings: Findings, options: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def machine(load: list[float] | None = None) -> dict[str, Any]:
+def machine(at_start: list[float] | None) -> dict[str, Any]:
     """Return what times depend on: processor, number of processors, vector width, system, and the given load."""
     return {
         "cpu": _cpu_name(),
         "processors": available_threads(),
         "vector_bits": vector_bits(),
         "system": f"{platform.system()} {platform.machine()}",
-        "load": load,
+        "load": at_start,
     }
 
 
@@ -177,7 +188,7 @@ def print_tables(findings: Findings) -> None:
             console.print(_stages_table(size, stages))
     if findings.first:
         count = max(findings.threads)
-        table = _table(f"first call in a new process, warm disk cache, {findings.first_size}, {_threads(count)}")
+        table = new_table(f"first call in a new process, warm disk cache, {findings.first_size}, {_threads(count)}")
         for head in ("import s", "first call s"):
             table.add_column(head, justify="right")
         for key, seconds in findings.first.items():
@@ -187,14 +198,16 @@ def print_tables(findings: Findings) -> None:
         line = f"left out: {skip['contender']}, {skip['size']}, {_threads(skip['threads'])}: {skip['reason']}"
         console.print(line, markup=False, highlight=False)
     numbers = ", ".join(f"{name} {number}" for name, number in versions().items() if number)
-    load = "" if findings.load is None else f", load {findings.load[0]:.1f} at the start"
-    place = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{load}"
+    busy = "" if findings.load is None else f", load {findings.load[0]:.1f} at the start"
+    place = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{busy}"
     console.print(place, markup=False, highlight=False)
     console.print(numbers, highlight=False)
 
 
 def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> Table:
-    table = _table(f"{size.name}: {size.width}x{size.height}, {size.levels} levels, median of {findings.rounds} rounds")
+    table = new_table(
+        f"{size.name}: {size.width}x{size.height}, {size.levels} levels, median of {findings.rounds} rounds"
+    )
     weighed = any(name == size.name for name, _ in findings.memory)
     heads = ["threads", "ms", "q25-q75", "min", "x HH", "x 3WAY", "MDE/s", *(("MB", "of HH's") if weighed else ())]
     for head in heads:
@@ -210,9 +223,9 @@ def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> 
         table.add_row(
             row["contender"] + runs,
             str(row["threads"]),
-            _milliseconds(row["median_ms"]),
-            f"{_milliseconds(row['q25_ms'])}-{_milliseconds(row['q75_ms'])}",
-            _milliseconds(row["min_ms"]),
+            format_ms(row["median_ms"]),
+            f"{format_ms(row['q25_ms'])}-{format_ms(row['q75_ms'])}",
+            format_ms(row["min_ms"]),
             _times_faster(row["x_hh"], row["kind"]),
             _times_faster(row["x_3way"], row["kind"]),
             _figure(row["mde_per_s"], 0),
@@ -223,7 +236,7 @@ def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> 
 
 
 def _stages_table(size: Size, stages: dict[str, dict[str, float]]) -> Table:
-    table = _table(f"{size.name}: stages, 1 thread, ms", "stage")
+    table = new_table(f"{size.name}: stages, 1 thread, ms", "stage")
     for key in stages:
         table.add_column(label(key), justify="right")
     names: list[str] = []  # of all methods, each stage after the one that it follows in its method
@@ -236,7 +249,8 @@ def _stages_table(size: Size, stages: dict[str, dict[str, float]]) -> Table:
     return table
 
 
-def _table(title: str, first: str = "contender") -> Table:
+def new_table(title: str, first: str = "contender") -> Table:
+    """Return an empty table in the style of this command, with its first column."""
     table = Table(title=title, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column(first, no_wrap=True)
     return table
@@ -246,7 +260,8 @@ def _threads(count: int) -> str:
     return f"{count} thread" if count == 1 else f"{count} threads"
 
 
-def _milliseconds(value: float) -> str:
+def format_ms(value: float) -> str:
+    """Return milliseconds with about three digits."""
     return f"{value:.2f}" if value < 10 else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
 
 
@@ -280,7 +295,8 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _load() -> list[float] | None:
+def load() -> list[float] | None:
+    """Return the system's load over 1, 5 and 15 minutes, None where it does not tell."""
     try:
         return list(os.getloadavg())
     except (AttributeError, OSError):  # not on Windows

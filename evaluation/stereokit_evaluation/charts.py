@@ -115,7 +115,7 @@ def accuracy_time(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _bar(name: str, x: Sequence[str], y: Sequence[float | None], marker: dict[str, Any]) -> dict[str, Any]:
     hover = "%{x}: %{y:.2f} %<extra>" + name + "</extra>"
-    labels = {"texttemplate": "%{y:.2~f}", "textposition": "outside", "textangle": -90, "cliponaxis": False}
+    labels = {"texttemplate": "%{y:.2f}", "textposition": "outside", "textangle": -90, "cliponaxis": False}
     labels |= {"textfont": {"size": 11}, "constraintext": "none"}
     return {"type": "bar", "name": name, "x": list(x), "y": list(y), "marker": marker, "hovertemplate": hover, **labels}
 

@@ -143,10 +143,15 @@ def chosen_frames(frames: Sequence[Frame], rows: Sequence[Row], show: int) -> li
 
 
 def _first_methods(rows: Sequence[Row]) -> list[str]:
-    """Return the two methods that the viewer starts with: the best by D1, against the first."""
+    """Return the two methods that the viewer starts with: the best by D1, against one of the same matcher."""
     scored = [row for row in rows if row.missing is None and row.result.frames]
     best = min(scored, key=lambda row: row.result.score.main.filled.d1() or 0.0)
-    return [best.configuration.name, next((row for row in scored if row is not best), best).configuration.name]
+    others = sorted((row for row in scored if row is not best), key=lambda row: _label(row) != _label(best))
+    return [row.configuration.name for row in (best, *others, best)[:2]]
+
+
+def _label(row: Row) -> str:
+    return row.configuration.label
 
 
 def _share(counts: Sequence[int]) -> float:

@@ -22,6 +22,7 @@ from stereokit.kernels.pool import available_threads
 from stereokit_evaluation import retraining
 from stereokit_evaluation._peers import HH, THREE_WAY, opencv_threads
 from stereokit_evaluation._progress import progress
+from stereokit_evaluation._speed_report import load as system_load
 from stereokit_evaluation._speed_report import machine, versions
 from stereokit_evaluation.datasets import load, select
 from stereokit_evaluation.frames import Frame
@@ -85,7 +86,7 @@ def study(
     configurations = build(methods, wanted, options, factories)
     if with_peers:
         configurations += [peer(key, levels) for key in (THREE_WAY, HH)]
-    about = machine()
+    about = machine(system_load())
     timing = {"threads": threads or available_threads(), "cpu": about["cpu"]}
     steps = len(chosen) * len(configurations)
     with opencv_threads(timing["threads"]), progress(steps) as (console, step):
@@ -106,6 +107,7 @@ def study(
         "dataset": dataset,
         "split": part,
         "frames": [frame.name for frame in used],
+        "frames_with_truth": _with_truth(found),
         "comparison": comparison(dataset, used),
         "source_of_published": PAPER,
         "warnings": warnings,
@@ -115,7 +117,9 @@ def study(
         "machine": about,
     }
     if not write_json(json_file, document):
-        heading = f"{dataset}{'' if part is None else ', ' + part}, {len(used)} frames"
+        counts = document["frames_with_truth"]
+        heading = f"{dataset}{'' if part is None else ', ' + part}, {len(used)} frames (noc {counts['noc']}, "
+        heading += f"occ {counts['occ']}, with objects {counts['objects']})"
         print_tables(heading, found, document["comparison"])
     if report and used:
         _report(output / "report.html", document, found, used, show, print_path=str(json_file) != "-")
@@ -137,6 +141,16 @@ def _frames(
         return select(every, frames), None, []
     part, every, warning = split(every, which)
     return select(every, frames), part, [warning] if warning else []
+
+
+def _with_truth(found: Study) -> dict[str, int]:
+    """Return how many of the scored frames have which ground truth: D1 columns cover different frames."""
+    scores = next((row.result.frames for row in found.rows if row.result.frames), ())
+    return {
+        "noc": sum(frame.score.noc.all.filled.pixels > 0 for frame in scores),
+        "occ": sum(frame.score.occ.all.filled.pixels > 0 for frame in scores),
+        "objects": sum((f.score.noc.bg + f.score.occ.bg).filled.pixels > 0 for f in scores),
+    }
 
 
 def _train(

@@ -84,7 +84,7 @@ def view(
         maps.append(viewer.Shown(name, found.disparity, found.valid, note))
     pair = viewer.pair(left.name, images[0], maps, occ=known, calibration=camera)
     page = render(
-        "view.html.j2", [pair], title=f"{left.name}, {right.name}", version=__version__,
+        "view.html.j2", [pair], title=_title(left, right), version=__version__,
         maps=maps, methods=[maps[0].name, maps[-1].name],
     )  # fmt: skip
     write_bytes(output, page)
@@ -98,3 +98,9 @@ def view(
         typer.echo(f"{output} ({len(page) / 1e6:.1f} MB){without}")
     if open_browser:
         webbrowser.open(output.resolve().as_uri())
+
+
+def _title(left: Path, right: Path) -> str:
+    """Return the files' names, with their folders where the names alone are the same."""
+    parts = 1 if left.name != right.name else 2
+    return " and ".join("/".join(path.resolve().parts[-parts:]) for path in (left, right))

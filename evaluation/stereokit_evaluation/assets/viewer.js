@@ -64,7 +64,7 @@ const Viewer = (() => {
         for (const canvas of Object.values(canvases)) Object.assign(canvas, { width: pair.width, height: pair.height });
       }
       Object.assign(state, { pair, a, b });
-      root.querySelector(".views").classList.toggle("tall", pair.width < 2.2 * pair.height);
+      root.querySelector(".views").classList.toggle("blind", !pair.truthValues);
       root.querySelectorAll("[data-needs-truth]").forEach((e) => (e.hidden = !pair.truthValues));
       get("top").textContent = `${pair.top.toFixed(0)} px`;
       const step = [...controls.frame.options].findIndex((o) => o.selected);
@@ -131,7 +131,7 @@ const Viewer = (() => {
         const error = how === null ? "" : text(e, 2, " px") + (bad ? " ✗" : "");
         const tr = document.createElement("tr");
         const th = Object.assign(document.createElement("th"), { scope: "row", textContent: name });
-        const cells = [text(d, 2, " px"), text(depth(d), 2, " m"), error, how ?? hidden];
+        const cells = [text(d, 2, " px"), text(depth(d), 2, " m"), ...(pair.truthValues ? [error] : []), how ?? hidden];
         tr.append(th, ...cells.map((c) => Object.assign(document.createElement("td"), { textContent: c })));
         return tr;
       };
@@ -145,6 +145,7 @@ const Viewer = (() => {
 
     function points() {
       const { pair, a } = state;
+      if (!pair) return;
       const canvas = get("view-cloud");
       Object.assign(canvas, { width: Math.min(1242, pair.width), height: Math.round(Math.min(1242, pair.width) * 0.5) });
       const image = pair.picture.getContext("2d").getImageData(0, 0, pair.width, pair.height);

@@ -93,7 +93,7 @@ const Maps = (() => {
     image.src = uri;
     await image.decode();
     const target = canvas(width, height);
-    target.getContext("2d").drawImage(image, 0, 0);
+    target.getContext("2d", { willReadFrequently: true }).drawImage(image, 0, 0);
     return target;
   }
 

@@ -10,7 +10,6 @@ A refiner that is not installed, or whose runtime is not, leaves its configurati
 from __future__ import annotations
 
 import hashlib
-import inspect
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -216,8 +215,11 @@ def _weights(refiner: Any, name: str) -> dict[str, str]:
     given = getattr(refiner, "fingerprint", None)
     given = given() if callable(given) else given
     module = sys.modules.get(type(refiner).__module__.partition(".")[0])
-    home = inspect.getsourcefile(module) if module is not None and getattr(module, "__file__", None) else None
-    source = fingerprint(Path(home).parent, everything=given is None) if home else ""
+    file = getattr(module, "__file__", None)
+    source = ""
+    if file is not None:  # a package is its folder, a module its file alone
+        place = Path(file).parent if hasattr(module, "__path__") else Path(file)
+        source = fingerprint(place, everything=given is None)
     return {"name": name, "weights": _stable(refiner) if given is None else str(given), "source": source}
 
 

@@ -12,7 +12,7 @@ from stereokit.errors import OptionError
 from stereokit_evaluation.frames import Frame
 from stereokit_evaluation.published import TEST_FRAMES, TRAINING_FRAMES, VALIDATION_FRAMES
 
-__all__ = ["SPLITS", "comparison", "split", "split_of"]
+__all__ = ["SPLITS", "comparison", "count_frames", "split", "split_of"]
 
 SPLITS = ("all", "train", "validation")
 
@@ -70,11 +70,16 @@ def split(frames: Sequence[Frame], which: str | None) -> tuple[str, list[Frame],
     return which, chosen, f"{lacking} of {_SIZES[which]} frames of KITTI 2015 are missing{detail}"
 
 
+def count_frames(frames: Sequence[Frame]) -> str:
+    """Return how many frames there are, in words."""
+    return f"{len(frames)} frame{'' if len(frames) == 1 else 's'}"
+
+
 def comparison(dataset: str, frames: Sequence[Frame]) -> str:
     """Return the line that says whether our figures and the published ones are of the same frames."""
     theirs = f"the paper's {VALIDATION_FRAMES} validation frames (e4) and {TEST_FRAMES} test frames (e5) of KITTI 2015"
     if dataset != "kitti2015":
-        return f"Not the same frames: published figures are of {theirs}, ours of {len(frames)} frames of {dataset}."
+        return f"Not the same frames: published figures are of {theirs}, ours of {count_frames(frames)} of {dataset}."
     shared = sum(split_of(frame) == "validation" for frame in frames)
     if shared == len(frames) == VALIDATION_FRAMES:
         return (

@@ -16,10 +16,11 @@ import typer
 
 from stereokit import METHODS, __version__
 from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
-from stereokit.errors import FileError, OptionError
+from stereokit.errors import OptionError
 from stereokit.io import check_output
 from stereokit.kernels.pool import available_threads
 from stereokit_evaluation import retraining
+from stereokit_evaluation._folders import check_folder, make_folder
 from stereokit_evaluation._peers import HH, THREE_WAY, opencv_threads
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation._speed_report import load as system_load
@@ -28,7 +29,7 @@ from stereokit_evaluation.datasets import load, select
 from stereokit_evaluation.frames import Frame
 from stereokit_evaluation.grid import build, parse_setting, peer, settings_at_hand
 from stereokit_evaluation.published import PAPER
-from stereokit_evaluation.splits import comparison, split
+from stereokit_evaluation.splits import comparison, count_frames, split
 from stereokit_evaluation.study_run import Study, run_study
 from stereokit_evaluation.study_store import Store
 from stereokit_evaluation.study_table import as_json, print_tables
@@ -56,6 +57,7 @@ def study(
     max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
     count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
     threads: Annotated[int | None, typer.Option(help="Threads of the matchers.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     repeats: Annotated[int, typer.Option(help="Timed calls for each frame; the median counts.")] = 3,
     with_peers: Annotated[bool, typer.Option("--peers/--no-peers", help="OpenCV's modes too.")] = True,
     train: Annotated[bool, typer.Option("--train", help="Train each refiner for each matcher first.")] = False,
@@ -72,15 +74,16 @@ def study(
     run keeps what it has: the same command goes on.
     """
     check_json(json_file)
-    _check_folder(output)
+    check_folder(output)
     for name, value, least in (("repeats", repeats, 1), ("show", show, 0)):
         if value < least:
             raise OptionError(f"{name} must be at least {least}, got {value}")
     if which is not None and dataset != "kitti2015":
         raise OptionError(f"split must go with dataset kitti2015, got {dataset!r}")
     chosen, part, warnings = _frames(dataset, root, which, frames, count)
-    levels = max_disparity or max((f.max_disparity for f in chosen if f.max_disparity), default=_DEFAULT_DISPARITIES)
-    options = {"max_disparity": levels, "threads": threads, **parse_settings(settings or ())}
+    suggested = max((f.max_disparity for f in chosen if f.max_disparity is not None), default=_DEFAULT_DISPARITIES)
+    levels = suggested if max_disparity is None else max_disparity
+    options = {"max_disparity": levels, "threads": threads, "device": device, **parse_settings(settings or ())}
     methods, wanted = method or list(METHODS), [parse_setting(name) for name in setting or settings_at_hand()]
     factories = _train(methods, wanted, dataset, root, count, options, output) if train else {}
     configurations = build(methods, wanted, options, factories)
@@ -96,7 +99,7 @@ def study(
 
         for line in warnings:
             tell(f"warning: {line}")
-        store = Store(output / "results")
+        store = Store(make_folder(output / "results"))
         found = run_study(chosen, configurations, store, repeats=repeats, about_times=timing, step=step, tell=tell)
         if found.interrupted:
             tell("interrupted: the figures cover the frames done so far; the same command goes on")
@@ -118,18 +121,12 @@ def study(
     }
     if not write_json(json_file, document):
         counts = document["frames_with_truth"]
-        heading = f"{dataset}{'' if part is None else ', ' + part}, {len(used)} frames (noc {counts['noc']}, "
+        heading = f"{dataset}{'' if part is None else ', ' + part}, {count_frames(used)} (noc {counts['noc']}, "
         heading += f"occ {counts['occ']}, with objects {counts['objects']})"
         print_tables(heading, found, document["comparison"])
     if report and used:
         _report(output / "report.html", document, found, used, show, print_path=str(json_file) != "-")
     _exit(found, explicit=setting is not None)
-
-
-def _check_folder(output: Path) -> None:
-    nearest = next(place for place in (output, *output.absolute().parents) if place.exists())
-    if not nearest.is_dir():
-        raise FileError(f"output must be a folder, got {str(output)!r} ({str(nearest)!r} is a file)")
 
 
 def _frames(

@@ -33,6 +33,8 @@ __all__ = ["Row", "Study", "measure", "run_study"]
 
 Clock = Callable[[], float]
 
+_HOPELESS = 3  # frames that a configuration fails on, before any that it can do, until it is given up
+
 
 @dataclass(frozen=True, eq=False)
 class Row:
@@ -94,11 +96,18 @@ class _Loaded:
 
     @cached_property
     def truth(self) -> dict[str, NDArray[Any] | None]:
-        return {
-            "noc": self.frame.load_noc(),
-            "occ": self.frame.load_occ(),
-            "objects": self.frame.load_objects(),
-        }
+        maps = {name: getattr(self.frame, f"load_{name}")() for name in ("noc", "occ", "objects")}
+        size = self.images[0].shape[:2]
+        for name, values in maps.items():
+            if values is not None and values.shape != size:
+                raise InputError(f"{name} must have the size of the images, {size}, got {values.shape}")
+        return maps
+
+    @cached_property
+    def digest(self) -> str:
+        if self.frame.noc is None and self.frame.occ is None:
+            raise FileError("no ground truth found")
+        return frame_digest(self.frame)
 
 
 def run_study(
@@ -146,6 +155,13 @@ def run_study(
     done: dict[int, dict[str, Record]] = {index: {} for index in range(len(configurations)) if index not in missing}
     failed: dict[str, list[tuple[int | None, str]]] = {}
     warm: set[int] = set()
+
+    def fail(frame: Frame, index: int | None, reason: str) -> None:
+        tell(f"skipped {frame.name}: {_named(configurations, index, reason)}")
+        failed.setdefault(frame.name, []).append((index, reason))
+        if index is not None and not done[index] and _times_failed(failed, index) == _HOPELESS:
+            missing[index] = reason  # and its frames count again
+
     common = [_source(), repeats, gray, about_times]
     try:
         for frame in every:
@@ -155,30 +171,23 @@ def run_study(
                 if index in missing:
                     continue
                 step(f"{frame.name}: {configuration.name}", 1)
-                try:
-                    if frame.noc is None and frame.occ is None:
-                        raise FileError("no ground truth found")
-                    content = _content(loaded)
-                except (StereokitError, OSError) as error:
-                    failed.setdefault(frame.name, []).append((None, describe_error(error)))
-                    tell(f"skipped {frame.name}: {describe_error(error)}")
-                    break
-                key = digest([content, configuration.identity, *common])
                 place = f"{configuration.label}/{configuration.setting}/{frame.name}"
-                record = store.get(place, key)
+                try:
+                    key = digest([loaded.digest, configuration.identity, *common])
+                    record = store.get(place, key)
+                    if record is None:
+                        _ = loaded.images, loaded.truth  # here, because trouble with these is the frame's
+                except (StereokitError, OSError) as error:
+                    fail(frame, None, describe_error(error))
+                    break
                 if record is None:
                     try:
                         record = measure(configuration, loaded, repeats, warm=index in warm)
                     except ImportError as error:  # a refiner's runtime, asked for at its first call
                         missing[index] = describe_error(error)
                         continue
-                    except (StereokitError, OSError) as error:
-                        reason = describe_error(error)
                     except Exception as error:  # a plug-in's slip must not end a long run
-                        reason = f"{configuration.name}: {describe_error(error)}"
-                    if record is None:
-                        failed.setdefault(frame.name, []).append((index, reason))
-                        tell(f"skipped {frame.name}: {reason}")
+                        fail(frame, index, describe_error(error))
                         continue
                     warm.add(index)
                     store.put(place, key, record, {"frame": frame.name, "identity": configuration.identity})
@@ -234,12 +243,12 @@ def measure(
     return Record(counts, {name: 1e3 * median(run[name] for run in runs) for name in runs[0]})
 
 
-def _content(loaded: _Loaded) -> str:
-    """Return the digest of the frame's content, once a frame."""
-    found = loaded.__dict__.get("digest")
-    if found is None:
-        found = loaded.__dict__["digest"] = frame_digest(loaded.frame)
-    return str(found)
+def _named(configurations: Sequence[Configuration], index: int | None, reason: str) -> str:
+    return reason if index is None else f"{configurations[index].name}: {reason}"
+
+
+def _times_failed(failed: dict[str, list[tuple[int | None, str]]], index: int) -> int:
+    return sum(cause == index for causes in failed.values() for cause, _ in causes)
 
 
 def _source() -> list[str]:
@@ -264,7 +273,7 @@ def _pool(
     present = [records for index, records in done.items() if index not in missing]
     shared = [name for name in (present[0] if present else ()) if all(name in records for records in present)]
     for name, causes in failed.items():
-        told = [reason for cause, reason in causes if cause is None or cause not in missing]
+        told = [_named(configurations, cause, reason) for cause, reason in causes if cause not in missing]
         if told:
             study.skipped.append(Skipped(name, told[0]))
     for index, configuration in enumerate(configurations):

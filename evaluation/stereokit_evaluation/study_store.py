@@ -21,6 +21,7 @@ import numpy as np
 
 from stereokit.errors import FileError
 from stereokit.io import write_bytes
+from stereokit_evaluation._folders import make_folder
 from stereokit_evaluation.frames import Frame
 from stereokit_evaluation.metrics import Counts, Regions, Score, Tally
 
@@ -86,10 +87,7 @@ class Store:
         if self.folder is None:
             return
         file = self._file(path, key)
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FileError(f"output {str(self.folder)!r} cannot be written to: {error.strerror or error}") from error
+        make_folder(file.parent)
         content = {"score": asdict(record.score), "ms": record.ms, "key": key, "about": about}
         write_bytes(file, json.dumps(content, default=str).encode())
 

@@ -33,6 +33,7 @@ def view(
     scale: Annotated[float, typer.Option(help="Match at this size, such as 0.5.")] = 1.0,
     refiner: Annotated[list[str] | None, typer.Option(help="For --scale 0.5; may repeat.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage; may repeat.")
     ] = None,
@@ -53,7 +54,7 @@ def view(
     if refiner and scale == 1:
         raise OptionError(f"refiner needs --scale 0.5, got {', '.join(refiner)} with scale 1")
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
-    options |= {"threads": threads, **parse_settings(settings or ())}
+    options |= {"threads": threads, "device": device, **parse_settings(settings or ())}
     names = list(dict.fromkeys(method or ["S4"]))
     refiners: list[str | None] = [*refiner] if refiner else [None]
     matchers = {

@@ -119,7 +119,8 @@ def pixels(page, canvas):
     """Return the canvas's pixels as (H, W, 3) uint8, RGB."""
     uri = page.evaluate(
         """id => { const from = document.getElementById(id);
-                  const to = Object.assign(document.createElement('canvas'), { width: from.width, height: from.height });
+                  const to = document.createElement('canvas');
+                  [to.width, to.height] = [from.width, from.height];
                   to.getContext('2d', { willReadFrequently: true }).drawImage(from, 0, 0);
                   return to.toDataURL('image/png'); }""",
         canvas,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+
 import numpy as np
 import pytest
 
@@ -130,6 +132,20 @@ def test_fingerprints_follow_content(tmp_path):
     (tmp_path / "w.bin").write_text("2")
     assert grid.fingerprint(tmp_path) == source
     assert grid.fingerprint(tmp_path, everything=True) != everything
+
+
+def test_a_module_of_its_own_is_its_file_and_not_the_folder_around_it(tmp_path, monkeypatch):
+    (tmp_path / "lone_refiner.py").write_text("class Lone:\n    pass\n")
+    (tmp_path / "neighbour.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    made = importlib.import_module("lone_refiner").Lone()
+    before = grid._weights(made, "lone")
+    grid.fingerprint.cache_clear()
+    (tmp_path / "neighbour.py").write_text("changed = True")
+    assert grid._weights(made, "lone") == before
+    grid.fingerprint.cache_clear()
+    (tmp_path / "lone_refiner.py").write_text("class Lone:\n    changed = True\n")
+    assert grid._weights(made, "lone") != before
 
 
 def test_errors_are_one_line():

@@ -1,6 +1,4 @@
-"""The report and the page of one pair: whole, without a network, and true to the figures. The browser's part is
-in `test_browser`.
-"""
+"""The report and the page of one pair: whole, without a network, and true to the figures."""
 
 from __future__ import annotations
 

@@ -150,6 +150,7 @@ def test_broken_frames_are_left_out_for_all(pairs, tmp_path):
     assert list(reasons) == ["000", "001", "002", "003", "004"]
     assert "not an image that can be read" in reasons["000"] and "no such file" in reasons["001"]
     assert reasons["002"].startswith("left and right must have one size")
+    assert reasons["003"].startswith("occ must have the size of the images")
     assert reasons["004"] == "no ground truth found"
     assert [row["images"] for row in document["results"]] == [1, 1]
     assert all("\n" not in reason for reason in reasons.values())
@@ -197,12 +198,32 @@ def test_a_refiner_that_never_works_is_missing_and_harms_no_frame():
     cells = [fake("A", never), fake("B", no_runtime), fake("C", lambda left: None), fake("D", None, "not there")]
     found = run_study(frames(), cells, Store(None))
     assert [row.missing for row in found.rows] == [
-        "A Original: RuntimeError: weights are broken",
+        "RuntimeError: weights are broken",
         "needs the package 'torch', which is not installed",
         None,
         "not there",
     ]
     assert len(found.rows[2].result.frames) == 3 and not found.skipped
+
+
+def test_a_refiner_that_fails_at_first_is_given_up():
+    calls = []
+
+    def never(left):
+        calls.append(1)
+        raise RuntimeError("weights are broken")
+
+    found = run_study(frames(9), [fake("A", never), fake("B", lambda left: None)], Store(None))
+    assert len(calls) == 3 and found.rows[0].missing == "RuntimeError: weights are broken"
+    assert len(found.rows[1].result.frames) == 9 and not found.skipped
+
+
+def test_broken_frames_at_the_start_give_nobody_up(pairs):
+    write_pairs(pairs, 7)
+    for index in range(5):
+        (pairs / "left" / f"{index:03d}.png").write_text("no picture")
+    found = run_study(folder(pairs), [fake("A", lambda left: None)], Store(None))
+    assert found.rows[0].missing is None and len(found.rows[0].result.frames) == 2 and len(found.skipped) == 5
 
 
 def test_an_interrupt_keeps_whole_frames():
@@ -285,6 +306,7 @@ def test_killed_twice_it_ends_with_the_same_table(tmp_path):
         (("--split", "train"), OptionError, "split must go with dataset kitti2015, got 'folder'"),
         (("--frames", "77"), OptionError, "frames must be in the data set"),
         (("--json", "nowhere/x.json"), FileError, "--json 'nowhere/x.json': the folder 'nowhere' does not exist"),
+        (("--max-disparity", "0"), OptionError, "max_disparity must be"),
         (("--train",), OptionError, "train must go with dataset kitti2015 or scenes, got 'folder'"),
     ],
 )

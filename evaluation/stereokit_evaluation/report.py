@@ -27,7 +27,7 @@ from stereokit_evaluation.runner import Scored
 from stereokit_evaluation.study_run import Row, Study
 from stereokit_evaluation.study_table import missing_lines
 
-__all__ = ["chosen_frames", "render", "write_report"]
+__all__ = ["chosen_frames", "render", "require", "write_report"]
 
 _SCRIPTS = ("maps.js", "cloud.js", "viewer.js", "page.js")
 
@@ -100,8 +100,8 @@ def render(
     StereokitError
         If jinja2 or plotly is not installed.
     """
-    jinja2 = _needs("jinja2")
-    markup = _needs("markupsafe").Markup
+    jinja2 = require("jinja2")
+    markup = require("markupsafe").Markup
     folder = files("stereokit_evaluation") / "assets"
     names = (*_SCRIPTS, *(("charts.js",) if charts else ()))
     texts = {name: (folder / name).read_text(encoding="utf-8") for name in (*names, "style.css")}
@@ -191,11 +191,12 @@ def _json(value: Any) -> str:
 
 @lru_cache(maxsize=1)
 def _plotly() -> str:
-    script: str = _needs("plotly.offline").get_plotlyjs()
+    script: str = require("plotly.offline").get_plotlyjs()
     return base64.b64encode(gzip.compress(script.encode(), 9, mtime=0)).decode()
 
 
-def _needs(module: str) -> Any:
+def require(module: str) -> Any:
+    """Import a package of the extra ``report``, or raise StereokitError with the way to get it."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:

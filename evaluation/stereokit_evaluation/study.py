@@ -134,6 +134,8 @@ def _frames(
 ) -> tuple[list[Frame], str | None, list[str]]:
     """Return the frames, the name of the split, and warnings."""
     every = load(dataset, root, count=count)
+    if dataset == "scenes":
+        every[0].load_left()  # the package that draws them is there, or this says that it is not
     if dataset != "kitti2015":
         return select(every, frames), None, []
     part, every, warning = split(every, which)

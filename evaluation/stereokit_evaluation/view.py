@@ -18,7 +18,7 @@ from stereokit.io import check_output, read_disparity, read_image, write_bytes
 from stereokit_evaluation import viewer
 from stereokit_evaluation.grid import title
 from stereokit_evaluation.metrics import score
-from stereokit_evaluation.report import render
+from stereokit_evaluation.report import render, require
 
 __all__ = ["view"]
 
@@ -51,6 +51,7 @@ def view(
     """
     check_output(output, (".html", ".htm"), "output")
     check_json(json_file)
+    require("jinja2")
     if refiner and scale == 1:
         raise OptionError(f"refiner needs --scale 0.5, got {', '.join(refiner)} with scale 1")
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}

@@ -33,12 +33,12 @@ from stereokit.inputs import (
 )
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.workspace import Pool, Workspace
-from stereokit.methods import check_levels, option_names, parse_method
+from stereokit.methods import check_levels, find_refiner, option_names, parse_method
 from stereokit.postprocess.fill import FILLS, fill
 from stereokit.postprocess.median import median
 from stereokit.postprocess.smp import single_matching_phase
 from stereokit.postprocess.speckle import remove_speckles
-from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
+from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
 from stereokit.selection.wta import winners_like
 
@@ -70,8 +70,9 @@ class Matcher:
         negative. 1 to 2048 levels.
     scale : {1.0, 0.5}
         0.5 matches at half size and lets `refiner` bring the map to full size.
-    refiner : str or None
-        Name of the refiner, for ``scale=0.5``; None is ``"linear"``.
+    refiner : str, callable or None
+        For ``scale=0.5``: the name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
+        `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
     device : {"auto", "cpu", "cuda"}
         Where to compute. There are no CUDA kernels yet: "auto" is the CPU and "cuda" is refused.
     threads : int or None
@@ -80,12 +81,12 @@ class Matcher:
         How invalid pixels are filled; None (or ``"none"``) leaves them NaN.
     **options
         Options of the stages by name: those of the cost and of the aggregation (see `stereokit.costs.Census`,
-        `Zncc`, `stereokit.aggregation.Sgm`, `Dt`), ``subpixel``, and of the pipeline: ``smooth`` (sigma in pixels of
-        a Gaussian on both images before matching), ``uniqueness`` (percent by which the best rival must cost more,
-        or the pixel is invalid), ``smp`` (bool, single
-        matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the image),
-        ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of
-        the cost's range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the
+        `Zncc`, `stereokit.aggregation.Sgm`, `Dt`) and of the refiner, ``subpixel``, and of the pipeline: ``smooth``
+        (sigma in pixels of a Gaussian on both images before matching), ``uniqueness`` (percent by which the best
+        rival must cost more, or the pixel is invalid), ``smp`` (bool, single matching phase), ``speckle`` (largest
+        region of like disparity that is removed, as a share of the image), ``median`` (0, 3 or 5), ``outside``
+        (cost of matches outside the right image as a share of the cost's range, or None for the nearest border
+        pixel), ``confidence`` (bool) and ``right`` (bool, the
         right view's map too; twice the time). Defaults are those of `stereokit.defaults`.
 
     Raises
@@ -105,7 +106,8 @@ class Matcher:
 
     def __init__(
         self, method: str = "zncc+sgm", *, max_disparity: int = 128, min_disparity: int = 0, scale: float = 1.0,
-        refiner: str | None = None, device: str = "auto", threads: int | None = None, **options: Any,
+        refiner: str | Callable[..., Disparity] | None = None, device: str = "auto", threads: int | None = None,
+        **options: Any,
     ) -> None:  # fmt: skip
         self.method = parse_method(method)
         levels = check_levels(min_disparity, max_disparity)
@@ -122,17 +124,20 @@ class Matcher:
         self.threads = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
         if refiner is not None and self.scale == 1:
             raise OptionError(f"refiner needs scale=0.5, got refiner={refiner!r} with scale=1")
-        name = "linear" if refiner is None else refiner
-        self._refine = None if self.scale == 1 else REFINERS.get(name)()
-        self.refiner = None if self.scale == 1 else name.lower()
-        self._set_stages(options)
+        self.refiner: str | None = None
+        self._refine: Callable[..., Disparity] | None = None
+        refiner_options: list[str] = []
+        if self.scale == 0.5:
+            self.refiner, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
+            self._refine = factory(**{k: options[k] for k in refiner_options if k in options})
+        self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
         self._pool = Pool()
 
-    def _set_stages(self, options: dict[str, Any]) -> None:
+    def _set_stages(self, options: dict[str, Any], elsewhere: list[str]) -> None:
         cost_name, aggregation_name = self.method.split("+")
         cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         cost_options, aggregation_options = option_names(cost), option_names(aggregation)
-        check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options}))
+        check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options, *elsewhere}))
         merged = {**DEFAULTS[""], **DEFAULTS.get(self.method, {}), **options}
         self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
         if "p2" not in options and "p2" in merged:  # a default gives way to what the cost leaves of 8 bits
@@ -257,8 +262,7 @@ class Matcher:
             return self._match_levels(pair, self.min_disparity, self.max_disparity, workspace, threads)
         low, high = self.min_disparity // 2, -(-self.max_disparity // 2)
         coarse = self._match_levels(half_size(pair), low, max(high, low + 1), workspace, threads)
-        refined: Disparity = self._refine(coarse, pair.guide)
-        return refined
+        return self._refine(coarse, pair.guide, threads=threads)
 
     def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace, threads: int) -> Disparity:
         levels = Levels(low, high - low)

@@ -5,7 +5,9 @@ The built-in stages register themselves when this module imports them; others co
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 from stereokit import costs as _costs  # noqa: F401  (registers the built-in costs)
@@ -15,9 +17,9 @@ from stereokit.costs.rows import Levels
 from stereokit.defaults import METHODS
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import MAX_DISPARITY, check_integer, check_names
-from stereokit.registry import AGGREGATIONS, COSTS
+from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 
-__all__ = ["build_aggregation", "build_cost", "check_levels", "option_names", "parse_method"]
+__all__ = ["build_aggregation", "build_cost", "check_levels", "find_refiner", "option_names", "parse_method"]
 
 _MAX_LEVELS = 2048
 
@@ -72,6 +74,34 @@ def _build(kind: str, factory: Any, options: dict[str, Any]) -> Any:
     return factory(**options)
 
 
+def find_refiner(refiner: Any) -> tuple[str, Callable[..., Any], list[str]]:
+    """Return the name of a refiner, what makes it, and the names of its options.
+
+    Parameters
+    ----------
+    refiner : str or callable
+        A name, the path of a weight file, or a refiner itself, which has no further options.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such refiner.
+    OptionError
+        If it is neither a name nor callable.
+    """
+    if isinstance(refiner, str) and refiner.lower().endswith(".safetensors"):
+        factory = REFINERS.get("file")
+        return refiner, partial(factory, weights=refiner), [n for n in option_names(factory) if n != "weights"]
+    if isinstance(refiner, str):
+        factory = REFINERS.get(refiner)
+        return refiner.lower(), factory, option_names(factory)
+    if not callable(refiner):
+        raise OptionError(f"refiner must be a name, a weight file or callable, got {refiner!r}")
+    return type(refiner).__name__.lower(), lambda: refiner, []
+
+
 def option_names(factory: Any) -> list[str]:
-    """Return the names of the options of a stage; a stage that is no class has none."""
-    return [f.name for f in fields(factory) if f.init] if isinstance(factory, type) else []
+    """Return the names of the options of a stage; a stage that is no dataclass has none."""
+    if not (isinstance(factory, type) and is_dataclass(factory)):
+        return []
+    return [f.name for f in fields(factory) if f.init]

@@ -316,3 +316,101 @@ def double(image, height, width):
                 a * b * float(image[j, i]) for j, a in weights(y, image.shape[0]) for i, b in weights(x, image.shape[1])
             )
     return out
+
+
+def convolve(image, weight, bias, stride=1):
+    """Convolution of (C, H, W) with (outputs, C, k, k) weights, the border padded with k // 2 zeros; float64."""
+    channels, height, width = image.shape
+    outputs, _, size, _ = weight.shape
+    rows, columns = -(-height // stride), -(-width // stride)
+    out = np.empty((outputs, rows, columns))
+    for y in range(rows):
+        for x in range(columns):
+            total = np.array(bias, np.float64)
+            for ky in range(size):
+                for kx in range(size):
+                    sy, sx = y * stride + ky - size // 2, x * stride + kx - size // 2
+                    if 0 <= sy < height and 0 <= sx < width:
+                        for c in range(channels):
+                            total += float(image[c, sy, sx]) * weight[:, c, ky, kx].astype(np.float64)
+            out[:, y, x] = total
+    return out
+
+
+def convolve_up(image, weight, bias):
+    """Transposed 5x5 convolution of (C, H, W) to double size: stride 2, padding 2, output padding 1; float64.
+
+    Input pixel (y, x) adds ``weight[c, :, ky, kx]`` times its value to output pixel (2y + ky - 2, 2x + kx - 2).
+    """
+    channels, height, width = image.shape
+    outputs = weight.shape[1]
+    out = np.empty((outputs, 2 * height, 2 * width))
+    out[:] = np.array(bias, np.float64)[:, None, None]
+    for y in range(height):
+        for x in range(width):
+            for ky in range(5):
+                for kx in range(5):
+                    ty, tx = 2 * y + ky - 2, 2 * x + kx - 2
+                    if 0 <= ty < 2 * height and 0 <= tx < 2 * width:
+                        for c in range(channels):
+                            out[:, ty, tx] += float(image[c, y, x]) * weight[c, :, ky, kx].astype(np.float64)
+    return out
+
+
+def leaky(values, slope=0.1):
+    """Leaky rectifier."""
+    return np.where(values > 0, values, slope * values)
+
+
+def phases_to_pixels(phases):
+    """Lay out four phases, (4, h, w), as one plane: phase 2i + j is row 2y + i, column 2x + j."""
+    _, height, width = phases.shape
+    out = np.empty((2 * height, 2 * width), phases.dtype)
+    for y in range(2 * height):
+        for x in range(2 * width):
+            out[y, x] = phases[2 * (y % 2) + x % 2, y // 2, x // 2]
+    return out
+
+
+def mixture(values, logits, residual, offsets):
+    """Full-size map in which each pixel is a softmax-weighted mean of half-size values around it, plus a residual.
+
+    `values` is (h, w); `logits` (number of offsets, 4, h, w), the second axis the phase; `residual` (4, h, w).
+    Neighbours beyond the border are the nearest pixel of the border.
+    """
+    height, width = values.shape
+    out = np.empty((2 * height, 2 * width))
+    for row in range(2 * height):
+        for column in range(2 * width):
+            y, x, phase = row // 2, column // 2, 2 * (row % 2) + column % 2
+            highest = max(float(v) for v in logits[:, phase, y, x])
+            shares = [math.exp(float(v) - highest) for v in logits[:, phase, y, x]]
+            total = 0.0
+            for share, (dy, dx) in zip(shares, offsets, strict=True):
+                total += share * float(values[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)])
+            out[row, column] = total / sum(shares) + float(residual[phase, y, x])
+    return out
+
+
+def divergence(mean, deviation, steps=20_000):
+    """Kullback-Leibler divergence of N(mean, deviation) from N(0, 1), integrated from its definition."""
+    total, width = 0.0, 24 * deviation / steps
+    for k in range(steps):
+        x = mean - 12 * deviation + (k + 0.5) * width
+        log_p = -0.5 * ((x - mean) / deviation) ** 2 - math.log(deviation)
+        log_q = -0.5 * x * x
+        total += math.exp(log_p) / math.sqrt(2 * math.pi) * (log_p - log_q) * width
+    return total
+
+
+def outliers(estimate, truth):
+    """Count of bad pixels and of known ones (truth above 0): off by more than 3 pixels and more than 5 %."""
+    bad = known = 0
+    for y in range(truth.shape[0]):
+        for x in range(truth.shape[1]):
+            true = float(truth[y, x])
+            if true > 0:
+                known += 1
+                error = abs(float(estimate[y, x]) - true)
+                bad += error > 3 and error / true > 0.05
+    return bad, known

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from stereokit.commandline import JsonOption, check_json, write_json
-from stereokit.errors import InputError, OptionError
+from stereokit.errors import InputError, OptionError, StereokitError
 from stereokit.io import write_image
 from stereokit.result import colorize
 from stereokit_evaluation._folders import check_folder, make_folder
@@ -36,6 +36,7 @@ from stereokit_evaluation.scenes import Scene, generate
 __all__ = ["Panel", "demo", "overview"]
 
 _RUNS = 3
+_REFINER = "stereovae"
 _CAPTION_PX, _GAP_PX = 26, 6
 _PAPER, _INK = (250, 250, 250), (32, 32, 36)
 
@@ -69,9 +70,8 @@ class Panel:
 class _Outcome:
     """One method's map, score and median time."""
 
-    method: str
+    matcher: Any
     label: str
-    device: str
     disparity: NDArray[np.float32]
     score: Score
     seconds: float
@@ -141,6 +141,9 @@ def demo(
     method: Annotated[
         list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat. Default: S1 to S4.")
     ] = None,
+    refiner: Annotated[
+        str, typer.Option(help="Refiner of the last row, S4 at half size; none leaves it out.")
+    ] = _REFINER,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -149,17 +152,28 @@ def demo(
     _check_places(output, json_file)
     from stereokit import METHODS, Matcher
 
+    short = {full: name for name, full in METHODS.items()}
     matchers: dict[str, Any] = {}
     for name in method or list(METHODS):
         matcher = Matcher(name, max_disparity=max_disparity, threads=threads)
-        matchers.setdefault(str(matcher.method), matcher)
-    short = {full: name for name, full in METHODS.items()}
+        full = str(matcher.method)
+        matchers.setdefault(f"{short[full]} {full}" if full in short else full, matcher)
     console = Console(stderr=True)
+    if refiner != "none":
+        options: dict[str, Any] = {"max_disparity": max_disparity, "threads": threads, "scale": 0.5}
+        try:
+            matchers[f"S4/2+{Path(refiner).stem} {METHODS['S4']} at half size"] = Matcher(
+                "S4", refiner=refiner, **options
+            )
+        except StereokitError as error:
+            if refiner != _REFINER:
+                raise
+            console.print(f"without a refined map: {error}", markup=False, highlight=False, soft_wrap=True)
     scene = generate(seed, width, height, max_disparity)
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right))
     outcomes: list[_Outcome] = []
-    for name, matcher in matchers.items():
-        with console.status(f"{name}: compiling, once"):
+    for label, matcher in matchers.items():
+        with console.status(f"{label}: compiling, once"):
             found = matcher(left, right)
         times = []
         for _ in range(_RUNS):
@@ -167,8 +181,7 @@ def demo(
             found = matcher(left, right)
             times.append(time.perf_counter() - start)
         scored = score(found.disparity, noc=scene.noc, occ=scene.occ, objects=scene.objects, measured=found.valid)
-        label = f"{short[name]} {name}" if name in short else name
-        outcomes.append(_Outcome(name, label, str(matcher.device), found.disparity, scored, statistics.median(times)))
+        outcomes.append(_Outcome(matcher, label, found.disparity, scored, statistics.median(times)))
     make_folder(output)
     _write_pictures(output, scene, outcomes)
     document = {"results": [_as_json(outcome) for outcome in outcomes]}
@@ -200,7 +213,7 @@ def _write_pictures(folder: Path, scene: Scene, outcomes: Sequence[_Outcome]) ->
     for outcome in outcomes:
         found = colorize(outcome.disparity, 0.0, high)
         wrong = error_map(outcome.disparity, scene.occ, scene.noc, dilate=False)
-        stem = outcome.label.split()[0].replace("+", "-")
+        stem = outcome.label.split()[0].replace("/2", "-half").replace("+", "-")
         pictures |= {stem: found, f"{stem}_error": wrong}
         panels.append(Panel(outcome.label, found, wrong, outcome.score.noc.all.filled.d1(), 1000 * outcome.seconds))
     pictures["overview"] = overview(scene.left, truth, panels)
@@ -225,10 +238,10 @@ def _as_json(outcome: _Outcome) -> dict[str, Any]:
     """Return one entry of ``results``, in the form of ``stereokit evaluate``."""
     main = outcome.score.main
     return {
-        "method": outcome.method,
-        "scale": 1.0,
-        "refiner": None,
-        "device": outcome.device,
+        "method": outcome.matcher.method,
+        "scale": outcome.matcher.scale,
+        "refiner": outcome.matcher.refiner,
+        "device": outcome.matcher.device,
         "images": 1,
         "d1": {"noc": d1(outcome.score.noc), "occ": d1(outcome.score.occ)},
         "epe": main.filled.epe(),

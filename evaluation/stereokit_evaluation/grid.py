@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -21,9 +21,9 @@ from typing import Any
 import cv2
 
 import stereokit
-from stereokit.errors import OptionError, UnknownNameError, did_you_mean
+from stereokit.errors import FileError, OptionError, UnknownNameError, did_you_mean
 from stereokit.matching import METHODS, Matcher
-from stereokit.methods import option_names, parse_method
+from stereokit.methods import find_refiner, option_names, parse_method
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit_evaluation import _peers
 from stereokit_evaluation.runner import Matching
@@ -46,7 +46,10 @@ PAPER_SETTINGS = {"linear": "Mini+Linear", "original": "Original", "cnn": "Mini+
 PEER = "peer"
 """The setting of another library's matcher."""
 
-Factories = Mapping[tuple[str, str], Callable[[], Any]]
+_NO_SETTINGS = ("file",)  # the registry's name for a weight file, which is a setting by its path
+
+Trained = Mapping[tuple[str, str], Any]
+"""Method and setting to what `stereokit.Matcher` takes as its refiner: a weight file, or a refiner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,22 +92,28 @@ class Configuration:
 
 def title(setting: str) -> str:
     """Return what tables call a setting: ``"Mini+CNN"``."""
-    return PAPER_SETTINGS.get(setting) or f"Mini+{setting}"
+    return PAPER_SETTINGS.get(setting) or f"Mini+{Path(setting).stem if _is_file(setting) else setting}"
 
 
 def settings_at_hand() -> list[str]:
     """Return the paper's settings and one for each further refiner that is registered."""
-    return [*PAPER_SETTINGS, *(name for name in REFINERS.names() if name not in PAPER_SETTINGS)]
+    return [*PAPER_SETTINGS, *(n for n in REFINERS.names() if n not in PAPER_SETTINGS and n not in _NO_SETTINGS)]
 
 
 def parse_setting(text: str) -> str:
-    """Return the setting called `text`: ``"original"``, a refiner, or ``"Mini+REFINER"``, in any case.
+    """Return the setting called `text`: ``"original"``, a refiner, ``"Mini+REFINER"``, or a weight file.
 
     Raises
     ------
     UnknownNameError
         If the paper has no such setting and no such refiner is registered.
+    FileError
+        If there is no such weight file.
     """
+    if _is_file(text):
+        if not Path(text).is_file():
+            raise FileError(f"setting must name a weight file that exists, got {text!r}")
+        return text
     known = settings_at_hand()
     name = text.strip().lower().removeprefix("mini+")
     if name not in known:
@@ -116,7 +125,7 @@ def build(
     methods: Sequence[str],
     settings: Sequence[str],
     options: Mapping[str, Any],
-    factories: Factories | None = None,
+    trained: Trained | None = None,
 ) -> list[Configuration]:
     """Return the grid, matcher by matcher, in the order given.
 
@@ -127,9 +136,9 @@ def build(
     settings : sequence of str
         As `parse_setting` returns them.
     options : mapping
-        Options of `stereokit.Matcher`. An option of a stage goes to the methods that have this stage only.
-    factories : mapping, optional
-        Refiners that were trained for one method: (method, setting) to a function that builds the refiner.
+        Options of `stereokit.Matcher`. An option of a stage, or of a refiner, goes to those that have it only.
+    trained : mapping, optional
+        Refiners that were trained for one method: (method, setting) to a weight file or a refiner.
 
     Raises
     ------
@@ -140,8 +149,15 @@ def build(
     for option in options:
         if all(option in _foreign(name) for name in names):
             raise OptionError(f"option {option!r} must belong to a chosen method, got {', '.join(names)}")
+    learned = {setting: _refiner_options(setting) for setting in settings}
+    everywhere = {option for names_ in learned.values() for option in names_}
+
+    def fitting(name: str, setting: str) -> dict[str, Any]:
+        left_out = _foreign(name) | everywhere - learned[setting]
+        return {option: value for option, value in options.items() if option not in left_out}
+
     return [
-        _configure(name, setting, {k: v for k, v in options.items() if k not in _foreign(name)}, factories or {})
+        _configure(name, setting, fitting(name, setting), learned[setting], (trained or {}).get((name, setting)))
         for name in names
         for setting in dict.fromkeys(settings)
     ]
@@ -179,38 +195,50 @@ def describe_error(error: BaseException) -> str:
     return text if isinstance(error, stereokit.StereokitError) else f"{type(error).__name__}: {text}".rstrip(": ")
 
 
-def _configure(method: str, setting: str, options: dict[str, Any], factories: Factories) -> Configuration:
+def _configure(
+    method: str, setting: str, options: dict[str, Any], learned: frozenset[str], trained: Any
+) -> Configuration:
     label = next((short for short, name in METHODS.items() if name == method), method)
     if setting == "original":
         matcher = Matcher(method, **options)
-        return Configuration(method, label, setting, matcher, _identity(matcher, None))
-    Matcher(method, scale=0.5, **options)  # a bad option is the user's, and no reason to call a refiner missing
-    name = setting
-    if (factory := factories.get((method, setting))) is not None:
-        name = f"{setting}@{method.replace('+', '-')}"
-        if name not in REFINERS.names():
-            REFINERS.register(name)(factory)
-    elif setting not in REFINERS.names():
+        return Configuration(method, label, setting, matcher, _identity(matcher))
+    # A bad option is the user's, and no reason to call a refiner missing.
+    Matcher(method, scale=0.5, **{name: value for name, value in options.items() if name not in learned})
+    if trained is None and not _is_file(setting) and setting not in REFINERS.names():
         return Configuration(method, label, setting, missing=f"no refiner named {setting!r} is installed")
     try:
-        matcher = Matcher(method, scale=0.5, refiner=name, **options)
-        return Configuration(method, label, setting, matcher, _identity(matcher, name))
+        matcher = Matcher(method, scale=0.5, refiner=setting if trained is None else trained, **options)
+        return Configuration(method, label, setting, matcher, _identity(matcher))
     except Exception as error:  # a plug-in's own trouble: weights or a runtime that are not there
         return Configuration(method, label, setting, missing=describe_error(error))
 
 
-def _identity(matcher: Matcher, refiner: str | None) -> dict[str, Any]:
+def _is_file(setting: str) -> bool:
+    return setting.lower().endswith(".safetensors")
+
+
+def _refiner_options(setting: str) -> frozenset[str]:
+    """Return the names of a refiner's own options; of one that cannot be loaded, none."""
+    if setting == "original":
+        return frozenset()
+    try:
+        return frozenset(find_refiner(setting)[2])
+    except Exception:
+        return frozenset()
+
+
+def _identity(matcher: Matcher) -> dict[str, Any]:
     options = {name: _stable(value) for name, value in sorted(vars(matcher).items()) if not name.startswith("_")}
     for name in ("threads", "refiner"):  # the map does not depend on threads; the refiner follows
         options.pop(name, None)
     return {
         "options": options,
         "source": fingerprint(Path(stereokit.__file__).parent),
-        "refiner": None if refiner is None else _weights(vars(matcher).get("_refine"), refiner),
+        "refiner": None if matcher.scale == 1 else _weights(vars(matcher).get("_refine")),
     }
 
 
-def _weights(refiner: Any, name: str) -> dict[str, str]:
+def _weights(refiner: Any) -> dict[str, str]:
     """Return what tells one refiner from another: its own fingerprint or its looks, and the files that it came in."""
     given = getattr(refiner, "fingerprint", None)
     given = given() if callable(given) else given
@@ -220,7 +248,7 @@ def _weights(refiner: Any, name: str) -> dict[str, str]:
     if file is not None:  # a package is its folder, a module its file alone
         place = Path(file).parent if hasattr(module, "__path__") else Path(file)
         source = fingerprint(place, everything=given is None)
-    return {"name": name, "weights": _stable(refiner) if given is None else str(given), "source": source}
+    return {"weights": _stable(refiner) if given is None else str(given), "source": source}
 
 
 def _stable(value: Any) -> str:

@@ -7,7 +7,7 @@ configuration (`stereokit_evaluation.study_store`), so that an interrupted run g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -61,6 +61,9 @@ def study(
     repeats: Annotated[int, typer.Option(help="Timed calls for each frame; the median counts.")] = 3,
     with_peers: Annotated[bool, typer.Option("--peers/--no-peers", help="OpenCV's modes too.")] = True,
     train: Annotated[bool, typer.Option("--train", help="Train each refiner for each matcher first.")] = False,
+    train_settings: Annotated[
+        list[str] | None, typer.Option("--train-set", metavar="KEY=VALUE", help="Setting of the training; may repeat.")
+    ] = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Results are kept here; a later run goes on.")
     ] = Path("study"),
@@ -85,8 +88,20 @@ def study(
     levels = suggested if max_disparity is None else max_disparity
     options = {"max_disparity": levels, "threads": threads, "device": device, **parse_settings(settings or ())}
     methods, wanted = method or list(METHODS), [parse_setting(name) for name in setting or settings_at_hand()]
-    factories = _train(methods, wanted, dataset, root, count, options, output) if train else {}
-    configurations = build(methods, wanted, options, factories)
+    if train_settings and not train:
+        raise OptionError(f"train-set must go with train, got {train_settings[0]!r} alone")
+    names = [cell.method for cell in build(methods, ["original"], {"max_disparity": levels, "device": device})]
+    trained: dict[tuple[str, str], str] = {}
+    if train:
+        learners = [name for name in wanted if name in retraining.TRAINED]
+        given = retraining.training_frames(dataset, root, chosen)
+        for name, refiner in itertools.product(names, learners):
+            typer.echo(f"training {refiner} for {name}", err=True)
+            trained[name, refiner] = retraining.retrain(
+                name, refiner, given, output / "trained", dataset=dataset, root=root, max_disparity=levels,
+                settings=train_settings or (),
+            )  # fmt: skip
+    configurations = build(methods, wanted, options, trained)
     if with_peers:
         configurations += [peer(key, levels) for key in (THREE_WAY, HH)]
     about = machine(system_load())
@@ -149,26 +164,6 @@ def _with_truth(found: Study) -> dict[str, int]:
         "noc": sum(frame.score.noc.all.filled.pixels > 0 for frame in scores),
         "occ": sum(frame.score.occ.all.filled.pixels > 0 for frame in scores),
         "objects": sum((f.score.noc.bg + f.score.occ.bg).filled.pixels > 0 for f in scores),
-    }
-
-
-def _train(
-    methods: Sequence[str],
-    settings: Sequence[str],
-    dataset: str,
-    root: Path | None,
-    count: int,
-    options: dict[str, Any],
-    output: Path,
-) -> dict[tuple[str, str], Any]:
-    """Return a factory for each matcher and trained refiner."""
-    frames = retraining.training_frames(dataset, root, count)
-    names = [c.method for c in build(methods, ["original"], options)]
-    return {
-        (name, refiner): retraining.retrain(name, refiner, frames, output / "trained", options=options, tell=typer.echo)
-        for name in names
-        for refiner in settings
-        if refiner in retraining.TRAINED
     }
 
 

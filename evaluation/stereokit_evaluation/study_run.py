@@ -24,7 +24,7 @@ from stereokit.errors import FileError, InputError, StereokitError
 from stereokit_evaluation import datasets, frames, metrics
 from stereokit_evaluation._stage_times import GROUPS, OTHER, TOTAL, Watch, watched
 from stereokit_evaluation.frames import Frame
-from stereokit_evaluation.grid import PEER, Configuration, describe_error, fingerprint
+from stereokit_evaluation.grid import PEER, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.metrics import score
 from stereokit_evaluation.runner import Result, Scored, Skipped
 from stereokit_evaluation.study_store import Record, Store, digest, frame_digest
@@ -171,7 +171,7 @@ def run_study(
                 if index in missing:
                     continue
                 step(f"{frame.name}: {configuration.name}", 1)
-                place = f"{configuration.label}/{configuration.setting}/{frame.name}"
+                place = f"{configuration.label}/{title(configuration.setting)}/{frame.name}"
                 try:
                     key = digest([loaded.digest, configuration.identity, *common])
                     record = store.get(place, key)

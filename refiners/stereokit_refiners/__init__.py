@@ -1,6 +1,19 @@
-"""Refiners: from a half-size disparity map and the left image to a full-size map."""
+"""Refiners: from a half-size disparity map and the left image to a full-size map.
+
+Importing this package imports neither torch nor any runtime: they are loaded when a refiner needs them.
+"""
 
 from stereokit_refiners.linear import Linear
+from stereokit_refiners.network import CnnRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
 from stereokit_refiners.refiner import Refiner
+from stereokit_refiners.weights import WeightFile
 
-__all__ = ["Linear", "Refiner"]
+__all__ = [
+    "CnnRefiner",
+    "LearnedRefiner",
+    "Linear",
+    "PyramidRefiner",
+    "Refiner",
+    "StereoVaeRefiner",
+    "WeightFile",
+]

@@ -22,7 +22,7 @@ __all__ = ["Linear"]
 class Linear:
     """Bilinear upscaling by two; the left image is used for its size only."""
 
-    def __call__(self, coarse: Disparity, left: NDArray[Any]) -> Disparity:
+    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the map at the size of `left`; see `stereokit_refiners.refiner.Refiner`."""
         height, width = left.shape
 

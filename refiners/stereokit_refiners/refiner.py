@@ -1,7 +1,7 @@
 """The contract of a refiner.
 
-A refiner is built without arguments (``factory()``) and called with the half-size map and the full-size left image.
-Packages announce theirs in the entry-point group ``stereokit.refiners``.
+A refiner is built by its factory (with options, if it is a dataclass that has some) and called with the half-size
+map and the full-size left image. Packages announce theirs in the entry-point group ``stereokit.refiners``.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ __all__ = ["Refiner"]
 class Refiner(Protocol):
     """Brings a half-size map to full size."""
 
-    def __call__(self, coarse: Disparity, left: NDArray[Any]) -> Disparity:
+    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the full-size map.
+
+        Must be safe to call from several threads at once.
 
         Parameters
         ----------
@@ -27,9 +29,11 @@ class Refiner(Protocol):
             Map of the half-size pair, in half-size pixels, NaN where invalid.
         left : (H, W) uint8
             Left grey image at full size.
+        threads : int
+            How many threads this call may use; the result must not depend on it.
 
         Returns
         -------
         Disparity, (H, W)
-            In full-size pixels.
+            In full-size pixels, on arrays of its own.
         """

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 import numba
 
-__all__ = ["inline", "kernel"]
+__all__ = ["FINGERPRINT", "inline", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,7 +32,8 @@ def _fingerprint() -> str:
     return digest.hexdigest()[:12]
 
 
-_FINGERPRINT = _fingerprint()
+FINGERPRINT = _fingerprint()
+"""A digest of the package's source: it changes with anything that a result may depend on."""
 
 
 # Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
@@ -42,7 +43,7 @@ _FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 
 def kernel(function: F) -> F:
     """Compile `function` as a kernel that Python code calls."""
-    function.__qualname__ = f"{function.__qualname__}_{_FINGERPRINT}"
+    function.__qualname__ = f"{function.__qualname__}_{FINGERPRINT}"
     compiled: F = numba.njit(cache=True, **_FLAGS)(function)
     return compiled
 

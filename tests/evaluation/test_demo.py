@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("skimage")
 
 import stereokit
-from stereokit.errors import FileError, InputError, OptionError
+from stereokit.errors import FileError, InputError, OptionError, StereokitError
 from stereokit_evaluation import demo as module
 from stereokit_evaluation.demo import Panel, demo, overview
 
@@ -26,8 +26,11 @@ def stand_in(monkeypatch):
     calls = []
 
     class Matcher:
-        def __init__(self, method, *, max_disparity, threads):
+        def __init__(self, method, *, max_disparity, threads, scale=1.0, refiner=None):
             self.method = METHODS.get(method.upper(), method)
+            self.scale, self.refiner = scale, refiner
+            if refiner == "absent":
+                raise StereokitError("refiner 'absent' is not there")
             self.device, self.max_disparity = "cpu", max_disparity
             if "+" not in self.method:
                 raise OptionError(f"no method named {method!r}")
@@ -47,15 +50,17 @@ def stand_in(monkeypatch):
 def test_demo_writes_pictures_table_and_figures(stand_in, tmp_path, capsys):
     folder, figures = tmp_path / "deep" / "out", tmp_path / "figures.json"
     demo(folder, seed=1, size="160x90", max_disparity=48, json_file=figures)
-    names = ["S1", "S1_error", "S4", "S4_error", "left", "overview", "right", "truth"]
-    assert sorted(path.name for path in folder.iterdir()) == [f"{name}.png" for name in names]
+    refined = ["S4-half-stereovae", "S4-half-stereovae_error"]
+    names = ["S1", "S1_error", "S4", *refined, "S4_error", "left", "overview", "right", "truth"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(f"{name}.png" for name in names)
     scene = module.generate(1, 160, 90, 48)
     for name, image in (("left", scene.left), ("right", scene.right)):
         np.testing.assert_array_equal(cv2.imread(str(folder / f"{name}.png"))[..., ::-1], image)
     for name in ("S1", "S1_error", "truth"):
         assert cv2.imread(str(folder / f"{name}.png")).shape == (90, 160, 3)
     rows = json.loads(figures.read_text())["results"]
-    assert [row["method"] for row in rows] == ["census+dt", "zncc+sgm"]
+    assert [row["method"] for row in rows] == ["census+dt", "zncc+sgm", "zncc+sgm"]
+    assert [(row["scale"], row["refiner"]) for row in rows] == [(1.0, None), (1.0, None), (0.5, "stereovae")]
     truth = scene.disparity[(scene.surface > 0) & ~scene.occluded].astype(float)
     error = np.abs(truth - 10)
     row = rows[0]
@@ -64,16 +69,32 @@ def test_demo_writes_pictures_table_and_figures(stand_in, tmp_path, capsys):
     assert 0 < row["density"] < 100 and row["seconds_per_image"] >= 0
     assert set(row["d1"]["occ"]) == {"all", "bg", "fg"}
     assert (row["scale"], row["refiner"], row["device"], row["images"]) == (1.0, None, "cpu", 1)
-    assert stand_in == ["census+dt"] * 4 + ["zncc+sgm"] * 4  # one warm-up and three timed
+    assert stand_in == ["census+dt"] * 4 + ["zncc+sgm"] * 8  # one warm-up and three timed
     printed = capsys.readouterr().out
     assert "S4 zncc+sgm" in printed and "D1 noc" in printed and f"{row['d1']['noc']['all']:.2f}" in printed
 
 
 def test_demo_takes_methods_once_and_prints_json(stand_in, tmp_path, capsys):
-    demo(tmp_path, size="33x17", max_disparity=16, method=["s4", "zncc+sgm", "a+b"], json_file=module.Path("-"))
+    demo(
+        tmp_path,
+        size="33x17",
+        max_disparity=16,
+        method=["s4", "zncc+sgm", "a+b"],
+        refiner="none",
+        json_file=module.Path("-"),
+    )
     rows = json.loads(capsys.readouterr().out)["results"]
     assert [row["method"] for row in rows] == ["zncc+sgm", "a+b"]
     assert (tmp_path / "S4_error.png").exists() and (tmp_path / "a-b.png").exists()
+
+
+def test_a_refiner_that_cannot_run_is_told_of_and_refused_when_asked_for(stand_in, tmp_path, capsys, monkeypatch):
+    with pytest.raises(StereokitError, match="'absent' is not there"):
+        demo(tmp_path, size="33x17", max_disparity=16, method=["S4"], refiner="absent")
+    monkeypatch.setattr(module, "_REFINER", "absent")
+    demo(tmp_path, size="33x17", max_disparity=16, method=["S4"], refiner="absent")
+    assert "without a refined map: refiner 'absent' is not there" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*half*"))
 
 
 @pytest.mark.parametrize("size", ["12", "0x5", "5x", "axb", "-3x4", "5x5x5"])

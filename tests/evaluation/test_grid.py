@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from stereokit.errors import OptionError, UnknownNameError
+from stereokit.errors import FileError, OptionError, UnknownNameError
 from stereokit.registry import REFINERS
 from stereokit_evaluation import grid
 from stereokit_evaluation.grid import build, describe_error, parse_setting, peer, settings_at_hand, title
@@ -112,16 +113,36 @@ def test_identities_hold_no_addresses():
     assert again[0] == again[1]
 
 
-def test_a_refiner_trained_for_one_method_serves_only_that(refiner):
-    made = []
-
-    def factory():
-        made.append(1)
-        return Weighted()
-
-    cells = build(["S2", "S4"], ["cnn"], {}, {("zncc+sgm", "cnn"): factory})
-    assert made and cells[1].missing is None and cells[1].name == "S4 Mini+CNN"
+def test_a_refiner_trained_for_one_method_serves_only_that(refiner, monkeypatch):
+    monkeypatch.setattr(REFINERS, "_entries", lambda: ())
+    refiner("linear", Linear)
+    cells = build(["S2", "S4"], ["cnn"], {}, {("zncc+sgm", "cnn"): Weighted()})
+    assert cells[0].missing == "no refiner named 'cnn' is installed"
+    assert cells[1].missing is None and cells[1].name == "S4 Mini+CNN"
     assert cells[1].identity["refiner"]["weights"] == "first"
+
+
+def test_options_of_a_refiner_go_to_it_alone(refiner):
+    @dataclass(frozen=True)
+    class Tuned(Linear):
+        strength: int = 1
+
+    refiner("tuned", Tuned)
+    plain = identities(build(["S2"], ["linear", "original", "tuned"], {}))
+    changed = identities(build(["S2"], ["linear", "original", "tuned"], {"strength": 3}))
+    assert [name for name in plain if plain[name] != changed[name]] == ["S2 Mini+tuned"]
+    with pytest.raises(OptionError, match="no option named 'strength'"):
+        build(["S2"], ["linear", "original"], {"strength": 3})
+
+
+def test_a_weight_file_is_a_setting(tmp_path):
+    with pytest.raises(FileError, match="setting must name a weight file that exists"):
+        parse_setting(str(tmp_path / "none.safetensors"))
+    (tmp_path / "mine.safetensors").write_bytes(b"not weights")
+    setting = parse_setting(str(tmp_path / "mine.safetensors"))
+    (cell,) = build(["S2"], [setting], {})
+    assert cell.name == "S2 Mini+mine" and cell.matcher is None and cell.missing
+    assert "file" not in settings_at_hand()
 
 
 def test_fingerprints_follow_content(tmp_path):
@@ -139,13 +160,13 @@ def test_a_module_of_its_own_is_its_file_and_not_the_folder_around_it(tmp_path, 
     (tmp_path / "neighbour.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     made = importlib.import_module("lone_refiner").Lone()
-    before = grid._weights(made, "lone")
+    before = grid._weights(made)
     grid.fingerprint.cache_clear()
     (tmp_path / "neighbour.py").write_text("changed = True")
-    assert grid._weights(made, "lone") == before
+    assert grid._weights(made) == before
     grid.fingerprint.cache_clear()
     (tmp_path / "lone_refiner.py").write_text("class Lone:\n    changed = True\n")
-    assert grid._weights(made, "lone") != before
+    assert grid._weights(made) != before
 
 
 def test_errors_are_one_line():

@@ -25,7 +25,7 @@ def refiners(monkeypatch):
     """Let there be linear, cnn (which works) and stereovae (whose runtime fails at the first call)."""
 
     class Broken:
-        def __call__(self, coarse, left):
+        def __call__(self, coarse, left, *, threads=1):
             raise ModuleNotFoundError("No module named 'runtime'", name="runtime")
 
     monkeypatch.setattr(REFINERS, "_entries", lambda: ())

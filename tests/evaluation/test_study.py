@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
 from stereokit.io import write_disparity
 from stereokit.registry import REFINERS
-from stereokit_evaluation import study_run
+from stereokit_evaluation import datasets, retraining, study_run
 from stereokit_evaluation.datasets import folder
 from stereokit_evaluation.frames import Frame
 from stereokit_evaluation.grid import Configuration
@@ -131,7 +131,7 @@ def test_a_damaged_record_is_made_anew(pairs, tmp_path):
     out, words = tmp_path / "out", ("--method", "S2", "--setting", "original")
     first = run(pairs, out, *words)
     files = sorted((out / "results").rglob("*.json"))
-    assert len(files) == 3 and files[0].parent == out / "results" / "S2" / "original"
+    assert len(files) == 3 and files[0].parent == out / "results" / "S2" / "Original"
     files[0].write_text("{")
     files[1].write_text(json.dumps({"score": {}, "ms": {}}))
     again = run(pairs, out, *words)
@@ -307,6 +307,7 @@ def test_killed_twice_it_ends_with_the_same_table(tmp_path):
         (("--frames", "77"), OptionError, "frames must be in the data set"),
         (("--json", "nowhere/x.json"), FileError, "--json 'nowhere/x.json': the folder 'nowhere' does not exist"),
         (("--max-disparity", "0"), OptionError, "max_disparity must be"),
+        (("--train-set", "steps=1"), OptionError, "train-set must go with train"),
         (("--train",), OptionError, "train must go with dataset kitti2015 or scenes, got 'folder'"),
     ],
 )
@@ -326,10 +327,37 @@ def test_an_output_that_is_no_folder_is_refused(pairs, tmp_path):
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_training_is_refused_in_one_line(tmp_path):
-    words = ["--dataset", "scenes", "--count", "1", "--train", "-o", str(tmp_path / "out")]
-    done = CliRunner().invoke(APP, words)
-    assert isinstance(done.exception, OptionError) and str(done.exception).startswith("train must be off")
+def test_training_gives_each_matcher_its_own_weights(tmp_path, monkeypatch):
+    calls = []
+
+    def train(home, refiner, *, frames, streets, method, settings, **given):
+        calls.append((refiner, method[0], frames, streets, settings))
+        (home / "weights.safetensors").write_bytes(b"not weights")
+
+    monkeypatch.setattr(retraining, "train", train)
+    monkeypatch.setattr(datasets, "_SCENE_SIZE", (96, 48))
+    datasets._scene.cache_clear()
+    words = ["--dataset", "scenes", "--count", "1", "--method", "S2", "--method", "S4", "--setting", "cnn"]
+    words += ["--setting", "linear", "--train", "--train-set", "steps=5", "-o", str(tmp_path / "out"), *SMALL]
+    for _ in range(2):  # the second time they are there
+        done = CliRunner().invoke(APP, [*words, "--json", "-"])
+        assert done.exit_code == 1, (done.output, done.exception)
+        assert calls == [("cnn", name, None, 160, ["steps=5"]) for name in ("census+sgm", "zncc+sgm")]
+    datasets._scene.cache_clear()
+    rows = json.loads(done.stdout)["results"]
+    assert [row["missing"] is None for row in rows] == [False, True, False, True]
+    assert "weights" in rows[0]["missing"]
+
+
+def test_frames_that_are_scored_are_not_trained_on(tmp_path):
+    for part in ("image_2", "image_3", "disp_noc_0"):
+        (tmp_path / part).mkdir()
+        for index in range(4):
+            (tmp_path / part / f"{index:06d}_10.png").write_bytes(b"")
+    every = datasets.kitti2015(tmp_path)
+    assert [f.name[:6] for f in retraining.training_frames("kitti2015", tmp_path, every[1:3])] == ["000000", "000003"]
+    with pytest.raises(OptionError, match="train must leave frames to train on"):
+        retraining.training_frames("kitti2015", tmp_path, every)
 
 
 def test_a_refiner_of_another_package_joins(pairs, tmp_path, monkeypatch):

@@ -1,0 +1,284 @@
+"""The command ``stereokit train``: a refiner for the maps of given matchers, from a data set, from streets, or both.
+
+The result is a folder with ``weights.safetensors`` (to be given as ``--refiner``), ``curves.csv``, ``curves.png``, and
+the checkpoint from which a killed run goes on when the same command is given again. With ``--folds`` each group of
+frames is held out once, and the pooled score over all of them is printed: an estimate for frames never seen, where the
+groups are whole drives.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
+from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit.io import write_bytes
+from stereokit_evaluation._progress import progress
+from stereokit_evaluation.datasets import load, select
+from stereokit_evaluation.frames import Frame
+from stereokit_evaluation.training_pairs import FIRST_SEED, pair_of, scene_pair
+
+__all__ = ["train"]
+
+_MATCHERS = ("S1", "S2", "S3", "S4")
+
+
+def train(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the result; made if missing.")],
+    refiner: Annotated[str, typer.Option(help="Architecture: stereovae, cnn or stereokit.")] = "stereovae",
+    dataset: Annotated[str | None, typer.Option(help="kitti2015, kitti2012, middlebury, folder ...")] = None,
+    root: Annotated[Path | None, typer.Option(help="Folder of the data set.")] = None,
+    frames: Annotated[str | None, typer.Option(help="Frames to train on, such as 13-33,46.")] = None,
+    validation: Annotated[str | None, typer.Option(help="Frames to look at on the way.")] = None,
+    folds: Annotated[str | None, typer.Option(help="Groups to hold out in turn: 0-3/13-17/18-33.")] = None,
+    extra: Annotated[
+        list[str] | None, typer.Option(metavar="DATASET:ROOT", help="More frames to train on, never held out.")
+    ] = None,
+    streets: Annotated[int, typer.Option(help="Synthetic streets to train on.")] = 0,
+    street_share: Annotated[float, typer.Option(help="Share of the crops that are of streets.")] = 0.5,
+    method: Annotated[list[str] | None, typer.Option(help="Matchers; may repeat. Default S1 to S4.")] = None,
+    variants: Annotated[int, typer.Option(help="Variants of each frame and matcher.")] = 9,
+    start: Annotated[Path | None, typer.Option(help="Weights to begin with.")] = None,
+    preset: Annotated[str, typer.Option(help="default, or paper for its recipe as printed.")] = "default",
+    settings: Annotated[list[str] | None, typer.Option("--set", help="Setting KEY=VALUE; may repeat.")] = None,
+    max_disparity: Annotated[int, typer.Option(help="Disparities of the matchers, full-size pixels.")] = 128,
+    cache: Annotated[Path | None, typer.Option(help="Folder of coarse maps; default OUTPUT/cache.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Train a refiner. Killed, it goes on from its checkpoint when called again with the same options."""
+    check_json(json_file)
+    torch = _torch()
+    from stereokit_refiners.training import Source
+    from stereokit_refiners.weights import NETWORKS, read
+
+    chosen = _settings(preset, settings or ())
+    if refiner not in NETWORKS:
+        raise OptionError(f"refiner to train must be one of {', '.join(NETWORKS)}, got {refiner!r}")
+    if dataset is None and streets < 1 and not extra:
+        raise OptionError("dataset, extra or streets must be given, got none of them")
+    if folds is not None and (dataset is None or validation is not None):
+        raise OptionError(f"folds must come with a dataset and without validation, got {folds!r}")
+    if not 0 <= street_share <= 1 or streets < 0 or variants < 1:
+        raise OptionError(
+            f"street_share must be from 0 to 1, streets at least 0 and variants at least 1, "
+            f"got {street_share:g}, {streets} and {variants}"
+        )
+    content = None if start is None else read(start)
+    if content is not None and content.network != refiner:
+        raise OptionError(f"start must hold weights of {refiner!r}, got those of {content.network!r}")
+    _folder(output)
+    held = cache or output / "cache"
+    methods = list(method or _MATCHERS)
+    everything = [] if dataset is None else list(load(dataset, root))
+    groups = _groups(everything, frames, validation, folds)
+    more = _extra(extra or ())
+    world = _join_group(torch)
+
+    def samples(which: Sequence[Frame], numbers: range, step: Callable[..., None]) -> list[Any]:
+        from stereokit_refiners.samples import load_variant
+
+        found = []
+        for frame in which:
+            pair = pair_of(frame)
+            for name in methods:
+                for number in numbers:
+                    found.append(load_variant(pair, name, chosen.seed, number, max_disparity, held))
+                    step(f"{frame.name} {name}")
+        return found
+
+    def street_samples(step: Callable[..., None]) -> list[Any]:
+        from stereokit_refiners.samples import load_variant
+
+        found = []
+        for k in range(streets):
+            pair = scene_pair(FIRST_SEED + k, held)
+            for n in (0, 1):
+                name = methods[(k + 2 * n) % len(methods)]
+                found.append(load_variant(pair, name, chosen.seed, n + 1, max_disparity, held))
+                step(pair.name)
+        return found
+
+    trained = {frame.name: frame for training, _ in groups for frame in training} | more
+    tested = {frame.name: frame for _, held_out in groups for frame in held_out}
+    total = (len(trained) * variants + len(tested)) * len(methods) + 2 * streets
+    with progress(total) as (_, step):
+        maps = {name: samples([frame], range(variants), step) for name, frame in trained.items()}
+        truth = {name: samples([frame], range(1), step) for name, frame in tested.items()}
+        scenes = street_samples(step)
+    results = []
+    for number, (training, held_out) in enumerate(groups):
+        sources = [Source(scenes, street_share if training else 1.0)] if scenes else []
+        names = [*(frame.name for frame in training), *more]
+        mine = [sample for name in names for sample in maps[name]]
+        if mine:
+            sources.append(Source(mine, 1 - street_share if scenes else 1.0))
+        folder = output if folds is None else output / f"fold-{number}"
+        where = [(frame.name, name) for frame in held_out for name in methods]
+        looked_at = [sample for frame in held_out for sample in truth[frame.name]]
+        outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world)
+        results.append(outcome | {"held_out": [frame.name for frame in held_out]})
+    if world[0] > 0:
+        return
+    document = {
+        "refiner": refiner, "settings": asdict(chosen), "methods": methods, "streets": streets,
+        "frames": sorted(trained), "results": results, "pooled": _pooled(results, methods),
+    }  # fmt: skip
+    if not write_json(json_file, document):
+        _print(document)
+
+
+def _torch() -> Any:
+    try:
+        import torch
+    except ImportError:
+        raise StereokitError("training needs torch, which is not installed: pip install 'stereokit[train]'") from None
+    return torch
+
+
+def _settings(preset: str, given: Sequence[str]) -> Any:
+    from stereokit_refiners.training import PRESETS, Settings
+
+    if preset not in PRESETS:
+        raise OptionError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+    options = parse_settings(given, frozenset())
+    known = [f.name for f in fields(Settings)]
+    for name in options:
+        if name not in known:
+            raise OptionError(f"no setting named {name!r}. Known: {', '.join(known)}")
+    try:
+        return Settings(**{**PRESETS[preset], **options})
+    except TypeError as error:
+        raise OptionError(f"a setting has a value of the wrong type ({error})") from None
+
+
+def _groups(
+    everything: Sequence[Frame], frames: str | None, validation: str | None, folds: str | None
+) -> list[tuple[list[Frame], list[Frame]]]:
+    """Return (training, held out) pairs of frames; no frame is in both."""
+    if folds is None:
+        held_out = select(everything, validation) if validation is not None else []
+        training = [f for f in select(everything, frames) if f not in held_out]
+        return [(training, held_out)]
+    parts = [select(everything, part) for part in folds.split("/")]
+    names = [frame.name for part in parts for frame in part]
+    if len(parts) < 2 or len(set(names)) < len(names):
+        raise OptionError(f"folds must be two groups or more that share no frame, got {folds!r}")
+    extra = [] if frames is None else [f for f in select(everything, frames) if f.name not in names]
+    return [([*(f for other in parts if other is not part for f in other), *extra], part) for part in parts]
+
+
+def _extra(given: Sequence[str]) -> dict[str, Frame]:
+    """Return the frames of further data sets by names that clash with no other."""
+    frames = {}
+    for text in given:
+        dataset, colon, root = text.partition(":")
+        if not colon or not root:
+            raise OptionError(f"extra must be DATASET:ROOT, got {text!r}")
+        frames.update({f"{text}/{frame.name}": frame for frame in load(dataset, root)})
+    return frames
+
+
+def _folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"output must be a folder, got {str(path)!r} ({error.strerror or error})") from error
+
+
+def _join_group(torch: Any) -> tuple[int, int]:
+    """Join the processes that torchrun started; return this one's number, and how many there are."""
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size == 1:
+        return 0, 1
+    torch.distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return int(os.environ["RANK"]), size
+
+
+def _train_one(
+    refiner: str, sources: Any, looked_at: Sequence[Any], where: Sequence[tuple[str, str]], settings: Any, start: Any,
+    folder: Path, world: tuple[int, int],
+) -> dict[str, Any]:  # fmt: skip
+    """Train, calibrate, write the folder; return the counts of bad and known pixels by matcher."""
+    from stereokit_refiners.training import bad_pixels, calibrated, fit, predict, restored
+    from stereokit_refiners.weights import NETWORKS, WeightFile, write
+
+    network = NETWORKS[refiner]
+    with progress(settings.steps) as (_, step):
+        at = 0
+
+        def tell(done: int, loss: float, score: float | None) -> None:
+            nonlocal at
+            shown = "" if score is None else f" D1 {score:.2f} %"
+            step(f"{folder.name} loss {loss:.2f}{shown}", done - at)
+            at = done
+
+        arrays, history = fit(
+            network, sources, looked_at, settings, start=None if start is None else start.arrays,
+            checkpoint=folder / "checkpoint.pt", progress=tell, rank=world[0], world=world[1],
+        )  # fmt: skip
+    module = restored(network, arrays)
+    counts: dict[str, list[int]] = {}
+    for sample, (_, name) in zip(looked_at, where, strict=True):
+        bad, known = bad_pixels(predict(module, settings.form, sample), sample)
+        total = counts.setdefault(name, [0, 0])
+        total[0] += bad
+        total[1] += known
+    if world[0] == 0:
+        ranges = calibrated(module, settings.form, sources)
+        notes = {"settings": asdict(settings), "start": None if start is None else start.fingerprint}
+        write(folder / "weights.safetensors", WeightFile(refiner, settings.form, arrays, ranges, notes))
+        write_bytes(folder / "curves.csv", history.csv())
+        write_bytes(folder / "curves.png", _curves(history))
+    return {"folder": str(folder), "bad_and_known": counts, "steps": history.rows[-1][0] if history.rows else 0}
+
+
+def _curves(history: Any) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    left = figure.add_subplot()
+    steps = [row[0] for row in history.rows]
+    left.plot(steps, [row[1] for row in history.rows], color="tab:blue", label="training loss")
+    left.set_xlabel("step")
+    left.set_ylabel("training loss", color="tab:blue")
+    if any(row[2] is not None for row in history.rows):
+        right = left.twinx()
+        right.plot(steps, [row[2] for row in history.rows], color="tab:red", label="validation D1")
+        right.set_ylabel("validation D1 noc, %", color="tab:red")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    return buffer.getvalue()
+
+
+def _pooled(results: Sequence[dict[str, Any]], methods: Sequence[str]) -> dict[str, float | None]:
+    pooled: dict[str, float | None] = {}
+    for name in methods:
+        counts = [r["bad_and_known"][name] for r in results if name in r["bad_and_known"]]
+        known = sum(n for _, n in counts)
+        pooled[name] = 100 * sum(bad for bad, _ in counts) / known if known else None
+    return pooled
+
+
+def _print(document: dict[str, Any]) -> None:
+    table = Table(title=f"{document['refiner']}: held-out frames", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("matcher")
+    table.add_column("D1 noc, %", justify="right")
+    for name, value in document["pooled"].items():
+        table.add_row(name, "-" if value is None else f"{value:.2f}")
+    console = Console()
+    console.print(table)
+    for result in document["results"]:
+        console.print(
+            f"wrote {json.dumps(result['folder'])[1:-1]}/weights.safetensors", highlight=False, soft_wrap=True
+        )

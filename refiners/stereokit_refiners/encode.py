@@ -1,0 +1,75 @@
+"""What a network sees: the coarse map and the image as floating-point tensors of about unit size.
+
+Two forms. ``"residual"`` is the one that is trained and shipped: ``disparity / 16 - 1.5`` in full-size pixels and
+``4 * (grey / 255 - 0.4)``, and the output corrects the upscaled map. ``"literal"`` is the paper's: both inputs scaled
+to [0, 1], ``disparity / 256`` and ``grey / 255``, and the output is the map itself over 256.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import OptionError
+
+__all__ = ["FORMS", "check_form", "encode", "half_image"]
+
+FORMS = ("residual", "literal")
+
+
+def check_form(form: str) -> str:
+    """Return `form`; raise OptionError if there is no such form."""
+    if form not in FORMS:
+        raise OptionError(f"form must be one of {', '.join(FORMS)}, got {form!r}")
+    return form
+
+
+def half_image(left: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the mean of each 2x2 pixels of an image with even sides, (2h, 2w) -> (h, w) float32."""
+    size = (left.shape[1] // 2, left.shape[0] // 2)
+    halved = cv2.resize(left.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(halved, np.float32).reshape(size[1], size[0])
+
+
+def encode(
+    names: tuple[str, ...], form: str, disparity: NDArray[np.float32], valid: NDArray[np.bool_], left: NDArray[Any]
+) -> dict[str, NDArray[np.float32]]:
+    """Return a network's inputs.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Which: "disparity", "image", "valid", "phases".
+    form : {"residual", "literal"}
+    disparity : (h, w) float32
+        Coarse map in full-size pixels, without NaN.
+    valid : (h, w) bool
+        Where it was measured.
+    left : (2h, 2w) uint8 or float32
+        Left image, grey levels 0 to 255.
+
+    Returns
+    -------
+    dict of (C, h, w) float32, C-contiguous
+    """
+    literal = form == "literal"
+
+    def gray(image: NDArray[Any]) -> NDArray[np.float32]:
+        values = image.astype(np.float32) * np.float32(1 / 255)
+        return values if literal else np.asarray((values - np.float32(0.4)) * np.float32(4), np.float32)
+
+    makers: dict[str, Callable[[], NDArray[np.float32]]] = {
+        "disparity": lambda: (
+            disparity * np.float32(1 / 256) if literal else disparity * np.float32(1 / 16) - np.float32(1.5)
+        ),
+        "image": lambda: gray(half_image(left)),
+        "valid": lambda: valid.astype(np.float32) * np.float32(2) - np.float32(1),
+        "phases": lambda: np.stack([gray(left[i::2, j::2]) for i in (0, 1) for j in (0, 1)]),
+    }
+    return {
+        name: np.ascontiguousarray(makers[name]().reshape(-1, *disparity.shape), dtype=np.float32) for name in names
+    }

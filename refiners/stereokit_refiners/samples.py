@@ -1,0 +1,288 @@
+"""Training samples: what a matcher makes of a pair under many conditions, and crops of that.
+
+Before matching, a pair is rescaled (disparities with it), its brightness and noise are changed, and the matcher's
+penalties and filters are drawn around their defaults, so that a refiner meets the mistakes of a matcher rather than
+those of a few images. Each *variant* is a function of (pair, method, seed, number) alone: it is made once, kept in a
+cache folder under a name that says all of that, and the same on every machine. Variant 0 is the pair as it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import stereokit
+from stereokit.defaults import DEFAULTS
+from stereokit.io import write_bytes
+from stereokit.kernels.jit import FINGERPRINT
+from stereokit.methods import parse_method
+
+__all__ = ["Crop", "Pair", "Sample", "crop", "load_variant", "make_variant", "whole"]
+
+_STEP = np.float32(1 / 256)  # maps are kept as KITTI keeps them
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A stereo pair with ground truth.
+
+    Parameters
+    ----------
+    name : str
+    left, right : (H, W) uint8
+    noc, occ : (H, W) float32
+        True disparity of what both cameras see, and of all pixels; full-size pixels, NaN unknown. One of them may
+        stand for both.
+    """
+
+    name: str
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    noc: NDArray[np.float32]
+    occ: NDArray[np.float32]
+
+    @property
+    def digest(self) -> str:
+        """A fingerprint of the content."""
+        found = hashlib.sha256()
+        for array in (self.left, self.right, self.noc, self.occ):
+            found.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        return found.hexdigest()[:16]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A coarse map with its image and the truth, in compact types.
+
+    Parameters
+    ----------
+    coarse : (h, w) uint16
+        Coarse map in 1/256 half-size pixels, filled.
+    valid : (h, w) bool
+        Where it was measured.
+    left : (2h, 2w) uint8
+    truth : (2h, 2w) uint16
+        1/256 full-size pixels, 0 unknown.
+    seen : (2h, 2w) bool
+        Where the truth is of a pixel that both cameras see.
+    size : (int, int)
+        Rows and columns of the image before it was extended to an even size.
+    """
+
+    coarse: NDArray[np.uint16]
+    valid: NDArray[np.bool_]
+    left: NDArray[np.uint8]
+    truth: NDArray[np.uint16]
+    seen: NDArray[np.bool_]
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """What a network is shown and held to, in floating point.
+
+    Parameters
+    ----------
+    disparity : (h, w) float32
+        Coarse map in full-size pixels.
+    valid : (h, w) bool
+    left : (2h, 2w) float32
+        Grey levels, 0 to 255.
+    truth : (2h, 2w) float32
+        Full-size pixels; 0 where `weight` is.
+    weight : (2h, 2w) float32
+        2 where both cameras see the pixel, 1 where only the left one does, 0 where the truth is unknown: the
+        paper's first loss, which counts pixels of both ground truths twice.
+    """
+
+    disparity: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    left: NDArray[np.float32]
+    truth: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+
+def _cut(sample: Sample, y: int, x: int, rows: int, columns: int) -> Crop:
+    small = np.s_[y : y + rows, x : x + columns]
+    large = np.s_[2 * y : 2 * (y + rows), 2 * x : 2 * (x + columns)]
+    truth = sample.truth[large]
+    weight = np.where(truth > 0, np.where(sample.seen[large], np.float32(2), np.float32(1)), np.float32(0))
+    return Crop(
+        sample.coarse[small] * (np.float32(2) * _STEP),
+        sample.valid[small],
+        sample.left[large].astype(np.float32),
+        truth * _STEP,
+        weight.astype(np.float32),
+    )
+
+
+def crop(sample: Sample, rows: int, columns: int, rng: np.random.Generator) -> Crop:
+    """Return a random part of a sample, `rows` x `columns` half-size pixels, at another exposure.
+
+    Smaller samples are extended by their border; what is added there has no weight.
+    """
+    height, width = sample.coarse.shape
+    y = int(rng.integers(0, max(height - rows, 0) + 1))
+    x = int(rng.integers(0, max(width - columns, 0) + 1))
+    part = _cut(sample, y, x, min(rows, height), min(columns, width))
+    gamma, contrast = float(np.exp(rng.normal(0, 0.2))), float(np.exp(rng.normal(0, 0.15)))
+    level = float(rng.normal(0, 12))
+    values = 255 * (part.left / np.float32(255)) ** np.float32(gamma)
+    left = np.clip((values - np.float32(128)) * np.float32(contrast) + np.float32(128 + level), 0, 255)
+    more = ((0, rows - part.disparity.shape[0]), (0, columns - part.disparity.shape[1]))
+    if more == ((0, 0), (0, 0)):
+        return Crop(part.disparity, part.valid, left.astype(np.float32), part.truth, part.weight)
+    twice = tuple((0, 2 * amount) for _, amount in more)
+    return Crop(
+        np.pad(part.disparity, more, mode="edge"),
+        np.pad(part.valid, more),
+        np.pad(left, twice, mode="edge").astype(np.float32),
+        np.pad(part.truth, twice),
+        np.pad(part.weight, twice),
+    )
+
+
+def whole(sample: Sample, multiple: int) -> Crop:
+    """Return all of a sample, extended to a multiple of `multiple` half-size pixels by its border."""
+    height, width = sample.coarse.shape
+    part = _cut(sample, 0, 0, height, width)
+    more = ((0, -height % multiple), (0, -width % multiple))
+    twice = tuple((0, 2 * amount) for _, amount in more)
+    return Crop(
+        np.pad(part.disparity, more, mode="edge"),
+        np.pad(part.valid, more),
+        np.pad(part.left, twice, mode="edge"),
+        np.pad(part.truth, twice),
+        np.pad(part.weight, twice),
+    )
+
+
+def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity: int = 128) -> Sample:
+    """Match one variant of a pair at half size.
+
+    Parameters
+    ----------
+    pair : Pair
+    method : str
+        As `stereokit.Matcher` takes it.
+    seed, number : int
+        Which variant; number 0 is the pair as it is, with the matcher's defaults.
+    max_disparity : int
+        Of the matcher, full-size pixels.
+
+    Returns
+    -------
+    Sample
+    """
+    left, right, noc, occ = pair.left, pair.right, pair.noc, pair.occ
+    options: dict[str, Any] = {}
+    if number > 0:
+        rng = np.random.default_rng([seed, number, int(pair.digest[:8], 16)])
+        left, right, noc, occ = _rescaled(rng, left, right, noc, occ)
+        left, right = _photographed(rng, left, right)
+        options = _drawn_options(rng, method)
+    left, right = _even(left), _even(right)
+    matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, **options)
+    found = matcher(half(left), half(right))
+    height, width = left.shape
+    truth = np.zeros((height, width), np.uint16)
+    seen = np.zeros((height, width), np.bool_)
+    rows, columns = noc.shape
+    seen[:rows, :columns] = np.isfinite(noc)
+    known = np.where(np.isfinite(noc), noc, occ)
+    truth[:rows, :columns] = np.where(np.isfinite(known), np.clip(np.rint(known / _STEP), 1, 65535), 0)
+    coarse = np.clip(np.rint(found.disparity / _STEP), 0, 65535).astype(np.uint16)
+    return Sample(coarse, found.valid, left, truth, seen, (rows, columns))
+
+
+def half(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the mean of each 2x2 pixels, as `stereokit.Matcher` shrinks a pair."""
+    return np.asarray(cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA))
+
+
+def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = image.shape
+    return np.asarray(cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
+
+
+def _rescaled(
+    rng: np.random.Generator, left: NDArray[Any], right: NDArray[Any], noc: NDArray[Any], occ: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return the pair at a random size; the truth's disparities follow the width."""
+    across = float(np.exp(rng.normal(0, 0.18)))
+    down = float(np.clip(across * np.exp(rng.normal(0, 0.1)), 0.6, 1.6))
+    across = float(np.clip(across, 0.6, 1.6))
+    rows, columns = left.shape
+    size = (max(64, round(columns * across)), max(64, round(rows * down)))
+    shrinks = across < 1 and down < 1
+    images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR) for i in (left, right)]
+    factor = np.float32(size[0] / columns)
+    maps = [cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) * factor for m in (noc, occ)]
+    return images[0], images[1], maps[0], maps[1]
+
+
+def _photographed(
+    rng: np.random.Generator, left: NDArray[Any], right: NDArray[Any]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return both views under another exposure, slightly different between them, with noise."""
+    gamma, gain = float(np.exp(rng.normal(0, 0.15))), float(np.exp(rng.normal(0, 0.12)))
+    noise = float(rng.exponential(1.0))
+    views = []
+    for view in (left, right):
+        own_gain, offset = float(np.exp(rng.normal(0, 0.02))), float(rng.normal(0, 1.5))
+        curve = 255 * (np.arange(256) / 255) ** gamma * gain * own_gain + offset
+        values = curve.astype(np.float32)[view] + np.float32(noise) * rng.standard_normal(view.shape, np.float32)
+        views.append(np.clip(np.rint(values), 0, 255).astype(np.uint8))
+    return views[0], views[1]
+
+
+def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
+    """Return the matcher's options, drawn around the defaults of `stereokit.defaults`."""
+    name = parse_method(method)
+    base = {**DEFAULTS[""], **DEFAULTS.get(name, {})}
+    options: dict[str, Any] = {
+        "smooth": float(np.clip(base["smooth"] * np.exp(rng.normal(0, 0.15)), 0.3, 1.2)),
+        "speckle": float(base["speckle"] * np.exp(rng.normal(0, 0.4))),
+        "median": int(rng.choice([3, 5, 5, 5])),
+    }
+    if "p1" in base:
+        scale = float(np.exp(rng.normal(0, 0.2)))
+        options["p1"] = base["p1"] * scale
+        options["p2"] = float(
+            np.clip(base["p2"] * scale * np.exp(rng.normal(0, 0.2)), base["p1"] * scale, base["p2"] * 1.5)
+        )
+    return options
+
+
+def cache_name(pair: Pair, method: str, seed: int, number: int, max_disparity: int) -> str:
+    """Return the file name of a variant: all that it depends on."""
+    own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
+    which = f"{pair.digest}-{method.lower().replace('+', '_')}-{max_disparity}-{seed}-{number}"
+    return f"{which}-{FINGERPRINT}-{own}.npz"
+
+
+def load_variant(
+    pair: Pair, method: str, seed: int, number: int, max_disparity: int = 128, cache: Path | None = None
+) -> Sample:
+    """Return a variant, from the cache folder if it is there; otherwise make it and keep it."""
+    path = None if cache is None else cache / cache_name(pair, method, seed, number, max_disparity)
+    if path is not None and path.exists():
+        with np.load(path) as held:
+            return Sample(
+                held["coarse"], held["valid"], held["left"], held["truth"], held["seen"], tuple(held["size"].tolist())
+            )
+    sample = make_variant(pair, method, seed, number, max_disparity)
+    if path is not None:
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **{k: np.asarray(v) for k, v in vars(sample).items()})
+        os.makedirs(path.parent, exist_ok=True)
+        write_bytes(path, buffer.getvalue())
+    return sample

@@ -1,0 +1,110 @@
+"""Refining torch tensors where they are: on a GPU, without a copy to the host.
+
+`TensorRefiner` is `LearnedRefiner` in torch from end to end (scaling, network, upsampling). It takes tensors, or
+anything that torch can view without a copy, such as the device arrays of numba or CuPy
+(``__cuda_array_interface__``).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from stereokit.errors import InputError, OptionError
+from stereokit_refiners._torch import Module, compose
+from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
+
+__all__ = ["TensorRefiner"]
+
+
+class TensorRefiner:
+    """A learned refiner of tensors.
+
+    Parameters
+    ----------
+    refiner : str or WeightFile
+        A name ("stereovae", "cnn", "stereokit"), the path of a ``.safetensors`` file, or its content.
+    device : str
+        Where to compute: "cuda", "cuda:1", "cpu".
+
+    Raises
+    ------
+    OptionError
+        If torch has no such device.
+    FileError
+        If the weights cannot be used.
+    """
+
+    def __init__(self, refiner: str | WeightFile, device: str = "cuda") -> None:
+        if isinstance(refiner, str):
+            refiner = read(refiner) if refiner.endswith(".safetensors") else shipped(refiner)
+        try:
+            self.device = torch.device(device)
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise OptionError(f"device must be one that torch has, got {device!r} ({reason})") from None
+        self.content = refiner
+        self.network = NETWORKS[refiner.network]
+        self._module = Module(self.network)
+        self._module.load(refiner.arrays)
+        self._module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._module.eval().requires_grad_(False)
+
+    def __call__(self, coarse: Any, valid: Any, left: Any) -> Tensor:
+        """Return the full-size map, on the device.
+
+        Parameters
+        ----------
+        coarse : (ceil(H/2), ceil(W/2)) float32
+            Half-size map in half-size pixels, without NaN.
+        valid : (ceil(H/2), ceil(W/2)) bool
+            Where it was measured.
+        left : (H, W) uint8
+            Grey image.
+
+        Returns
+        -------
+        (H, W) float32 tensor, full-size pixels
+
+        Raises
+        ------
+        InputError
+            If the sizes do not fit one another.
+        """
+        disparity, known, image = (torch.as_tensor(x, device=self.device) for x in (coarse, valid, left))
+        if image.ndim != 2 or disparity.shape != ((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2):
+            found = f"{tuple(disparity.shape)} and {tuple(image.shape)}"
+            raise InputError(f"coarse must be (H/2, W/2), rounded up, of left (H, W), got {found}")
+        if known.shape != disparity.shape:
+            raise InputError(f"valid must have the shape of coarse {tuple(disparity.shape)}, got {tuple(known.shape)}")
+        rows, columns = image.shape
+        height, width = disparity.shape
+        below, beside = -height % self.network.multiple, -width % self.network.multiple
+        with torch.inference_mode():
+            disparity = _extended(disparity.float() * 2, below, beside)
+            known = _extended(known.float(), below, beside)
+            gray = _extended(image.float(), 2 * (height + below) - rows, 2 * (width + beside) - columns)
+            heads = self._module(self._encoded(disparity, known, gray))
+            full = compose(self.network.name, self.content.form, heads["map"], disparity)
+            return full[0, 0, :rows, :columns].contiguous()
+
+    def _encoded(self, disparity: Tensor, valid: Tensor, left: Tensor) -> dict[str, Tensor]:
+        """Return the network's inputs: `stereokit_refiners.encode.encode` in torch."""
+        literal = self.content.form == "literal"
+        gray = left / 255 if literal else (left / 255 - 0.4) * 4
+        encoded = {
+            "disparity": disparity / 256 if literal else disparity / 16 - 1.5,
+            "image": F.avg_pool2d(gray, 2),
+            "phases": F.pixel_unshuffle(gray, 2),
+            "valid": valid * 2 - 1,
+        }
+        return {name: encoded[name] for name in self.network.inputs}
+
+
+def _extended(image: Tensor, below: int, beside: int) -> Tensor:
+    """Return (rows, columns) as (1, 1, rows + below, columns + beside), its border repeated."""
+    return F.pad(image[None, None], (0, beside, 0, below), mode="replicate")

@@ -1,0 +1,167 @@
+"""Weight files: safetensors, checked against the architecture, never code.
+
+A file holds the float32 arrays of one network and, as metadata, the format's version, the architecture, its form, the
+ranges for int8 and how it was trained. The shipped ones are in ``weights/`` beside this file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import FileError, StereokitError, did_you_mean
+from stereokit.io import write_bytes
+from stereokit_refiners.encode import FORMS
+from stereokit_refiners.layers import Network, shapes
+from stereokit_refiners.pyramid import Pyramid
+from stereokit_refiners.stereovae import NonVae, StereoVae
+
+__all__ = ["NETWORKS", "WeightFile", "network_named", "read", "shipped", "write"]
+
+NETWORKS: dict[str, Network] = {network.name: network for network in (StereoVae(), NonVae(), Pyramid())}
+"""Architectures by name."""
+
+_FORMAT = "stereokit-refiner/1"
+
+
+@dataclass(frozen=True, eq=False)
+class WeightFile:
+    """The content of a weight file.
+
+    Parameters
+    ----------
+    network : str
+        Architecture.
+    form : {"residual", "literal"}
+    arrays : dict of float32 arrays
+    ranges : dict of float
+        Largest absolute value of each activation, for int8; empty when it was not calibrated.
+    notes : dict
+        How it was trained: free, JSON.
+    """
+
+    network: str
+    form: str
+    arrays: Mapping[str, NDArray[np.float32]]
+    ranges: Mapping[str, float] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def fingerprint(self) -> str:
+        """A digest of everything that decides the result."""
+        found = hashlib.sha256(f"{self.network} {self.form} {sorted(self.ranges.items())}".encode())
+        for name in sorted(self.arrays):
+            found.update(name.encode() + self.arrays[name].tobytes())
+        return found.hexdigest()[:16]
+
+
+def network_named(name: str) -> Network:
+    """Return the architecture called `name`.
+
+    Raises
+    ------
+    FileError
+        If there is none.
+    """
+    if name not in NETWORKS:
+        raise FileError(did_you_mean("network", name, tuple(NETWORKS)))
+    return NETWORKS[name]
+
+
+def _library() -> Any:
+    try:
+        import safetensors
+        import safetensors.numpy
+    except ImportError:
+        raise StereokitError(
+            "learned refiners need safetensors, which is not installed: pip install 'stereokit[fast]'"
+        ) from None
+    return safetensors
+
+
+def write(path: str | Path, content: WeightFile) -> None:
+    """Write a weight file, all of it or nothing.
+
+    Raises
+    ------
+    FileError
+        If the arrays are not those of the network, or the file cannot be written.
+    """
+    _check(str(path), content.network, content.arrays)
+    metadata = {
+        "format": _FORMAT,
+        "network": content.network,
+        "form": content.form,
+        "ranges": json.dumps({name: float(bound) for name, bound in content.ranges.items()}, sort_keys=True),
+        "notes": json.dumps(content.notes, sort_keys=True),
+    }
+    arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in content.arrays.items()}
+    write_bytes(path, _library().numpy.save(arrays, metadata=metadata))
+
+
+def read(path: str | Path) -> WeightFile:
+    """Read a weight file.
+
+    Raises
+    ------
+    FileError
+        If it is missing, no such file, of another version, or its arrays are not those of its architecture.
+    """
+    library = _library()
+    text = str(path)
+    if not Path(path).is_file():
+        raise FileError(f"weights must name a file, got {text!r}, which is not there")
+    try:
+        with library.safe_open(text, framework="np") as held:
+            metadata = held.metadata() or {}
+            arrays = {name: held.get_tensor(name) for name in held.keys()}
+    except Exception as error:  # the library raises its own types
+        raise FileError(f"weights must be a safetensors file, got {text!r} ({' '.join(str(error).split())})") from None
+    if metadata.get("format") != _FORMAT:
+        raise FileError(f"weights must have the format {_FORMAT!r}, got {metadata.get('format')!r} in {text!r}")
+    name, form = metadata.get("network", ""), metadata.get("form", "")
+    if form not in FORMS:
+        raise FileError(f"form of the weights must be one of {', '.join(FORMS)}, got {form!r} in {text!r}")
+    _check(text, name, arrays)
+    try:
+        ranges = {str(k): float(v) for k, v in json.loads(metadata.get("ranges", "{}")).items()}
+        notes = dict(json.loads(metadata.get("notes", "{}")))
+    except (ValueError, TypeError, AttributeError):
+        raise FileError(f"weights must hold ranges and notes as JSON, got something else in {text!r}") from None
+    return WeightFile(name, form, arrays, ranges, notes)
+
+
+def shipped(name: str) -> WeightFile:
+    """Return the weights of `name` that come with the package.
+
+    Raises
+    ------
+    FileError
+        If none do.
+    """
+    path = files("stereokit_refiners") / "weights" / f"{name}.safetensors"
+    if not path.is_file():
+        raise FileError(f"no weights for {name!r} come with this version")
+    return read(str(path))
+
+
+def _check(path: str, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    wanted = shapes(network_named(name))
+    missing, unknown = sorted(set(wanted) - set(arrays)), sorted(set(arrays) - set(wanted))
+    if missing or unknown:
+        what = f"lacks {missing[0]!r}" if missing else f"has an unknown {unknown[0]!r}"
+        raise FileError(f"weights must be those of {name!r}, but {path!r} {what}")
+    for key, shape in wanted.items():
+        if arrays[key].shape != shape or arrays[key].dtype != np.float32:
+            found = f"{arrays[key].dtype} {arrays[key].shape}"
+            raise FileError(f"weights must hold {key!r} as float32 {shape}, got {found} in {path!r}")
+        if not np.isfinite(arrays[key]).all():
+            raise FileError(f"weights must be finite, but {key!r} in {path!r} is not")

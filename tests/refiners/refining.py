@@ -1,0 +1,74 @@
+"""What the tests of the refiners share: random weights, coarse maps, and small worlds to train on."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import cv2
+import numpy as np
+import pytest
+
+from stereokit import Disparity
+from stereokit_refiners.weights import NETWORKS, WeightFile, write
+
+NAN = np.nan
+NAMES = tuple(NETWORKS)
+LEARNED = [name for name in ("openvino", "onnxruntime", "torch") if importlib.util.find_spec(name)]
+needs_backend = pytest.mark.skipif(
+    not LEARNED or not importlib.util.find_spec("safetensors"), reason="needs a runtime for networks, and safetensors"
+)
+
+
+def random_arrays(name, seed=0, last=0.05):
+    """Return weights of a network: He et al. 2015 for all layers, `last` of that for the last; small biases."""
+    rng = np.random.default_rng(seed)
+    layers = NETWORKS[name].layers
+    arrays = {}
+    for layer in layers:
+        fan = layer.inputs * layer.kernel**2 / (4 if layer.up else 1)
+        scale = np.sqrt(2 / fan) * (last if layer is layers[-1] else 1)
+        arrays[f"{layer.name}.weight"] = (rng.standard_normal(layer.weight_shape) * scale).astype(np.float32)
+        arrays[f"{layer.name}.bias"] = (rng.standard_normal(layer.outputs) * 0.1).astype(np.float32)
+    return arrays
+
+
+def random_content(name, seed=0, form="residual", ranges=None, last=0.05):
+    return WeightFile(name, form, random_arrays(name, seed, last), ranges or {}, {"note": "random"})
+
+
+def weight_file(folder, name, seed=0, **given):
+    path = folder / f"{name}-{seed}.safetensors"
+    write(path, random_content(name, seed, **given))
+    return str(path)
+
+
+def half_of(size):
+    return tuple(-(-side // 2) for side in size)
+
+
+def coarse_of(size, seed=0, gaps=0.0, low=2.0, high=30.0):
+    """Return a smooth half-size map for an image of `size`, with some of it not measured."""
+    rng = np.random.default_rng(seed)
+    shape = half_of(size)
+    rough = cv2.GaussianBlur(rng.random(shape), (0, 0), 2).reshape(shape)
+    disparity = (low + (high - low) * rough).astype(np.float32)
+    disparity[rng.random(shape) < gaps] = NAN
+    valid = ~np.isnan(disparity) & (rng.random(shape) < 0.85)
+    return Disparity(disparity, valid, np.where(valid, rng.random(shape), 0).astype(np.float32))
+
+
+def image_of(size, seed=0):
+    return np.random.default_rng([seed, 7]).integers(0, 256, size).astype(np.uint8)
+
+
+def encoded_of(name, rows, columns, seed=0):
+    """Return random inputs of a network, (C, h, w) each."""
+    rng = np.random.default_rng([seed, 5])
+    return {key: rng.normal(0, 1, (count, rows, columns)).astype(np.float32) for key, count in
+            NETWORKS[name].inputs.items()}  # fmt: skip
+
+
+def one_line(error):
+    text = str(error)
+    assert text and "\n" not in text, text
+    return text

@@ -17,8 +17,9 @@ from stereokit_refiners import Linear
 
 @pytest.fixture
 def refiner(monkeypatch):
-    """Return a function that registers a refiner for the test."""
-    monkeypatch.setattr(REFINERS, "_items", dict(REFINERS._items))
+    """Let there be one refiner, linear; return a function that registers another for the test."""
+    monkeypatch.setattr(REFINERS, "_entries", lambda: ())
+    monkeypatch.setattr(REFINERS, "_items", {"linear": Linear})
 
     def register(name, factory):
         REFINERS._items[name] = factory
@@ -55,12 +56,10 @@ def test_the_grid_is_methods_times_settings():
     assert all(cell.matcher is not None and cell.missing is None for cell in cells)
 
 
-def test_a_refiner_that_is_not_there_is_missing_with_the_reason(refiner, monkeypatch):
+def test_a_refiner_that_is_not_there_is_missing_with_the_reason(refiner):
     def no_runtime():
         raise ModuleNotFoundError("No module named 'openvino'", name="openvino")
 
-    monkeypatch.setattr(REFINERS, "_entries", lambda: ())
-    refiner("linear", Linear)
     refiner("cnn", no_runtime)
     cells = {cell.setting: cell for cell in build(["S2"], ["linear", "cnn", "stereovae"], {})}
     assert cells["linear"].missing is None
@@ -113,9 +112,7 @@ def test_identities_hold_no_addresses():
     assert again[0] == again[1]
 
 
-def test_a_refiner_trained_for_one_method_serves_only_that(refiner, monkeypatch):
-    monkeypatch.setattr(REFINERS, "_entries", lambda: ())
-    refiner("linear", Linear)
+def test_a_refiner_trained_for_one_method_serves_only_that(refiner):
     cells = build(["S2", "S4"], ["cnn"], {}, {("zncc+sgm", "cnn"): Weighted()})
     assert cells[0].missing == "no refiner named 'cnn' is installed"
     assert cells[1].missing is None and cells[1].name == "S4 Mini+CNN"

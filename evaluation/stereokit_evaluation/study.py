@@ -92,9 +92,11 @@ def study(
         raise OptionError(f"train-set must go with train, got {train_settings[0]!r} alone")
     names = [cell.method for cell in build(methods, ["original"], {"max_disparity": levels, "device": device})]
     trained: dict[tuple[str, str], str] = {}
+    training: dict[str, Any] | None = None
     if train:
         learners = [name for name in wanted if name in retraining.TRAINED]
         given = retraining.training_frames(dataset, root, chosen)
+        training = {"frames": [frame.name for frame in given], "settings": train_settings or [], "refiners": learners}
         for name, refiner in itertools.product(names, learners):
             typer.echo(f"training {refiner} for {name}", err=True)
             trained[name, refiner] = retraining.retrain(
@@ -129,7 +131,8 @@ def study(
         "comparison": comparison(dataset, used),
         "source_of_published": PAPER,
         "warnings": warnings,
-        "options": {**options, "repeats": repeats, "trained": train, "count": count},
+        "options": {**options, "repeats": repeats, "count": count},
+        "training": training,
         "version": __version__,
         "versions": versions(),
         "machine": about,

@@ -9,6 +9,7 @@ whole numbers from 0 to 255 become what they are.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -16,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError, OptionError, did_you_mean
+from stereokit.kernels.gauss import blur_rows, taps
+from stereokit.kernels.pool import run, spans
+from stereokit.kernels.workspace import Workspace
 
 __all__ = [
     "GrayPair",
@@ -213,7 +217,7 @@ def guide_of(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(scaled), np.uint8)
 
 
-def smooth(pair: GrayPair, sigma: float) -> GrayPair:
+def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, threads: int = 1) -> GrayPair:
     """Return the pair with both images smoothed by a Gaussian; the guide stays as sharp as it was.
 
     The result is 16 bit, so that nothing is lost to rounding: 8-bit images are multiplied by 256 first.
@@ -223,16 +227,27 @@ def smooth(pair: GrayPair, sigma: float) -> GrayPair:
     pair : GrayPair
     sigma : float
         Standard deviation in pixels; 0 returns the pair itself.
+    workspace : Workspace or None
+        Where the smoothed images are kept until the next call; None makes new ones.
+    threads : int
+        Threads to use.
     """
     if sigma == 0:
         return pair
+    held = workspace or Workspace()
+    height, width = pair.left.shape
+    weights = held.once("smooth.taps", sigma, lambda: taps(sigma))
+    shift = 8 if pair.left.dtype == np.uint8 else 0
+    blurred = [held.array(f"smooth.{k}", (height, width), np.uint16) for k in (0, 1)]
 
-    def blur(image: NDArray[Any]) -> NDArray[np.uint16]:
-        wide = image.astype(np.uint16) << 8 if image.dtype == np.uint8 else image
-        blurred = cv2.GaussianBlur(wide, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(blurred, np.uint16).reshape(image.shape)
+    def blur(part: int, y0: int, y1: int) -> None:
+        line = held.array(f"smooth.line{part}", width + 2 * (weights.size - 1), np.uint32)
+        total = held.array(f"smooth.total{part}", width, np.uint32)
+        for image, out in zip((pair.left, pair.right), blurred, strict=True):
+            blur_rows(image, weights, shift, y0, y1, line, total, out)
 
-    return GrayPair(blur(pair.left), blur(pair.right), pair.left_bad, pair.right_bad, pair.guide)
+    run([partial(blur, k, y0, y1) for k, (y0, y1) in enumerate(spans(height, threads))], threads)
+    return GrayPair(blurred[0], blurred[1], pair.left_bad, pair.right_bad, pair.guide)
 
 
 def half_size(pair: GrayPair) -> GrayPair:

@@ -103,6 +103,25 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
         raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
 
 
+def make_folder(name: str, path: str | os.PathLike[str]) -> None:
+    """Make the folder `path` and those above it, unless it is there.
+
+    Parameters
+    ----------
+    name : str
+        What the caller's argument is called, for the message.
+
+    Raises
+    ------
+    FileError
+        If it cannot be made.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{name} must be a folder, got {str(path)!r} ({error.strerror or error})") from error
+
+
 def read_image(path: str | os.PathLike[str], gray: bool = False) -> NDArray[Any]:
     """Read an image as it is stored.
 

@@ -31,13 +31,11 @@ from stereokit.inputs import (
     half_size,
     smooth,
 )
-from stereokit.kernels.pool import available_threads
+from stereokit.kernels.pool import available_threads, crew
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.methods import check_levels, find_refiner, option_names, parse_method
-from stereokit.postprocess.fill import FILLS, fill
-from stereokit.postprocess.median import median
-from stereokit.postprocess.smp import single_matching_phase
-from stereokit.postprocess.speckle import remove_speckles
+from stereokit.postprocess.chain import Chain, post_process
+from stereokit.postprocess.fill import FILLS
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
 from stereokit.selection.wta import winners_like
@@ -265,34 +263,25 @@ class Matcher:
         return self._refine(coarse, pair.guide, threads=threads)
 
     def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace, threads: int) -> Disparity:
-        levels = Levels(low, high - low)
-        pair = smooth(pair, self.smooth)
+        with crew(threads):
+            return self._match_with_crew(pair, Levels(low, high - low), workspace, threads)
+
+    def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
+        low = levels.minimum
+        pair = smooth(pair, self.smooth, workspace, threads)
         shape = pair.left.shape
         rows = self.cost.prepare(
             Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads),
             workspace,
             max(2, threads),
         )
-        disparity = np.empty(shape, np.float32)
+        disparity = workspace.array("match.disparity", shape, np.float32)
         cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
         confidence = np.empty(shape, np.float32) if self.confidence else None
         out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness)
         self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, threads, out)
-        if pair.left_bad is not None:
-            disparity[pair.left_bad] = np.nan
-        if self.smp:
-            disparity = single_matching_phase(disparity, cost, threads=threads)
-        if self.speckle:
-            disparity = remove_speckles(
-                disparity, int(self.speckle * disparity.size), threads=threads, workspace=workspace
-            )
-        valid = ~np.isnan(disparity)
-        if self.fill is not None and not valid.any():
-            disparity[:] = low  # nothing was measured anywhere: as far away as the range goes
-        elif self.fill is not None:
-            disparity = fill(disparity, self.fill, threads=threads)
-        if self.median:
-            disparity = median(disparity, self.median)
+        chain = Chain(self.smp, int(self.speckle * disparity.size), self.fill, self.median, low)
+        disparity, valid = post_process(disparity, cost, pair.left_bad, chain, workspace, threads)
         if confidence is not None:
             confidence[~valid] = 0
         return Disparity(disparity, valid, confidence)

@@ -74,6 +74,8 @@ class Findings:
         Method to seconds ``import_s`` and ``call_s``, at `first_size`.
     stages : dict
         Size's name and method to stage to milliseconds, one thread.
+    allocated : dict
+        Size's name and method to bytes that a call in steady state takes above the maps that it returns, one thread.
     skipped : list of dict
         Contenders that were left out, and why.
     interrupted : bool
@@ -91,6 +93,7 @@ class Findings:
     first: dict[str, dict[str, float]] = field(default_factory=dict)
     first_size: str | None = None
     stages: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+    allocated: dict[tuple[str, str], int] = field(default_factory=dict)
     skipped: list[dict[str, Any]] = field(default_factory=list)
     interrupted: bool = False
     load: list[float] | None = field(default_factory=lambda: load())
@@ -146,7 +149,10 @@ def as_json(findings: Findings, options: dict[str, Any]) -> dict[str, Any]:
             for (size, key), amount in findings.memory.items()
         ],
         "first_call": [entry(findings.first_size, key, most, **seconds) for key, seconds in findings.first.items()],
-        "stages": [entry(size, key, 1, ms=stages) for (size, key), stages in findings.stages.items()],
+        "stages": [
+            entry(size, key, 1, ms=stages, allocated_bytes=findings.allocated.get((size, key)))
+            for (size, key), stages in findings.stages.items()
+        ],
         "skipped": findings.skipped,
         "sizes": {
             size.name: {
@@ -185,7 +191,8 @@ def print_tables(findings: Findings) -> None:
             console.print(_times_table(findings, size, here))
         stages = {key: ms for (name, key), ms in findings.stages.items() if name == size.name}
         if stages:
-            console.print(_stages_table(size, stages))
+            allocated = {key: count for (name, key), count in findings.allocated.items() if name == size.name}
+            console.print(_stages_table(size, stages, allocated))
     if findings.first:
         count = max(findings.threads)
         table = new_table(f"first call in a new process, warm disk cache, {findings.first_size}, {_threads(count)}")
@@ -235,7 +242,7 @@ def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> 
     return table
 
 
-def _stages_table(size: Size, stages: dict[str, dict[str, float]]) -> Table:
+def _stages_table(size: Size, stages: dict[str, dict[str, float]], allocated: dict[str, int]) -> Table:
     table = new_table(f"{size.name}: stages, 1 thread, ms", "stage")
     for key in stages:
         table.add_column(label(key), justify="right")
@@ -246,6 +253,9 @@ def _stages_table(size: Size, stages: dict[str, dict[str, float]]) -> Table:
                 names.insert(names.index(before) + 1 if before is not None else 0, name)
     for name in names:
         table.add_row(name, *("" if name not in ms else f"{ms[name]:.2f}" for ms in stages.values()))
+    table.add_section()
+    kilobytes = (f"{allocated[key] / 1e3:.1f}" if key in allocated else "-" for key in stages)
+    table.add_row("kB allocated above the maps returned", *kilobytes)
     return table
 
 

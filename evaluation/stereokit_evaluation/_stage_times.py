@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sys
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from stereokit import matching
 
-__all__ = ["GROUPS", "OTHER", "TOTAL", "Watch", "stage_times", "watched"]
+__all__ = ["GROUPS", "OTHER", "TOTAL", "Watch", "allocated_bytes", "stage_times", "watched"]
 
 OTHER, TOTAL = "other", "total"
 GROUPS = ("prepare", "match", "clean", "refine")
@@ -102,6 +103,28 @@ def stage_times(
     return {name: 1e3 * float(np.median([row.get(name, 0.0) for row in rows])) for name in (*names, OTHER, TOTAL)}
 
 
+def allocated_bytes(method: str, levels: int, left: NDArray[np.uint8], right: NDArray[np.uint8], threads: int) -> int:
+    """Return the most bytes that a call holds above what it held before and the maps that it returns.
+
+    Of the third call: by then all buffers are there. Python and numpy count, what OpenCV takes inside does not.
+    """
+    matcher = matching.Matcher(method, max_disparity=levels, threads=threads)
+    for _ in range(2):
+        matcher(left, right)
+    tracing = tracemalloc.is_tracing()
+    if not tracing:
+        tracemalloc.start()
+    try:
+        tracemalloc.reset_peak()
+        before, _ = tracemalloc.get_traced_memory()
+        result = matcher(left, right)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        if not tracing:
+            tracemalloc.stop()
+    return peak - before - result.disparity.nbytes - result.valid.nbytes
+
+
 @contextmanager
 def watched(matcher: Any, watch: Watch, *, groups: bool = False) -> Iterator[None]:
     """Replace the stages of `matcher` by timed ones, and put them back.
@@ -132,10 +155,13 @@ def watched(matcher: Any, watch: Watch, *, groups: bool = False) -> Iterator[Non
 def _targets(matcher: Any) -> list[tuple[Any, str, str, str | None]]:
     """Return where each stage's name is looked up: owner, attribute, the name to report and the stage's group."""
     found: list[tuple[Any, str, str, str | None]] = []
+    homes: dict[str, Any] = {}
     for attribute, value in vars(matching).items():
         if isinstance(value, FunctionType) and value.__module__.startswith(tuple(_STAGES)):
             group = next(group for module, group in _STAGES.items() if value.__module__.startswith(module))
             found.append((matching, attribute, _words(attribute), group))
+            homes[value.__module__] = sys.modules[value.__module__]
+    found += [(home, part, _words(part), None) for home in homes.values() for part in _kernels(home)]
     for stage, attribute, name, group in (
         (getattr(matcher, "cost", None), "prepare", "prepare cost", "prepare"),
         (getattr(matcher, "aggregation", None), "sweep", "sweep, around its kernels", "match"),
@@ -144,11 +170,18 @@ def _targets(matcher: Any) -> list[tuple[Any, str, str, str | None]]:
             found.append((type(stage), attribute, name, group))
     if callable(vars(matcher).get("_refine")):
         found.append((matcher, "_refine", "refine", "refine"))
-    home = sys.modules.get(type(getattr(matcher, "aggregation", None)).__module__)
-    for attribute, value in list(vars(home).items()) if home is not None else []:
-        if getattr(value, "signatures", None) and hasattr(value, "py_func"):  # a kernel that Python has called
-            found.append((home, attribute, f"sweep: {_words(attribute)}", None))
+    home = sys.modules[type(getattr(matcher, "aggregation", None)).__module__]
+    found += [(home, part, f"sweep: {_words(part)}", None) for part in _kernels(home)]
     return found
+
+
+def _kernels(home: Any) -> list[str]:
+    """Return the names of a module's kernels that Python has called, its own and those that it imports."""
+    return [
+        attribute
+        for attribute, value in vars(home).items()
+        if getattr(value, "signatures", None) and hasattr(value, "py_func")
+    ]
 
 
 def _words(name: str) -> str:

@@ -162,9 +162,8 @@ def demo(
     if refiner != "none":
         options: dict[str, Any] = {"max_disparity": max_disparity, "threads": threads, "scale": 0.5}
         try:
-            matchers[f"S4/2+{Path(refiner).stem} {METHODS['S4']} at half size"] = Matcher(
-                "S4", refiner=refiner, **options
-            )
+            label = f"S4/2+{Path(refiner).stem} {METHODS['S4']} at half size"
+            matchers[label] = Matcher("S4", refiner=refiner, **options)
         except StereokitError as error:
             if refiner != _REFINER:
                 raise

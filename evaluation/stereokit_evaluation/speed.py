@@ -31,7 +31,7 @@ from stereokit_evaluation._probes import ProbeError, first_call, memory_added, s
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation._rounds import round_robin
 from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, load, machine, print_tables, versions
-from stereokit_evaluation._stage_times import stage_times
+from stereokit_evaluation._stage_times import allocated_bytes, stage_times
 from stereokit_evaluation.grid import settings_at_hand
 from stereokit_evaluation.pipeline import PipelineRow, print_pipeline, time_pipeline
 from stereokit_evaluation.pipeline import as_json as pipeline_json
@@ -111,6 +111,7 @@ def bench(
                 for name in methods if stages else ():
                     with opencv_threads(1):
                         findings.stages[size.name, name] = stage_times(name, size.levels, *images, rounds)
+                        findings.allocated[size.name, name] = allocated_bytes(name, size.levels, *images, 1)
                     step(f"{size.name}: stages of {name}")
             if first:
                 size = next((size for size in chosen if size.name == "K"), chosen[0])

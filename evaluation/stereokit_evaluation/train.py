@@ -22,8 +22,9 @@ from rich.console import Console
 from rich.table import Table
 
 from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
-from stereokit.errors import FileError, OptionError, StereokitError
-from stereokit.io import write_bytes
+from stereokit.errors import InputError, OptionError, StereokitError
+from stereokit.io import make_folder, write_bytes
+from stereokit.methods import check_levels, parse_method
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation.datasets import load, select
 from stereokit_evaluation.frames import Frame
@@ -59,6 +60,7 @@ def train(
     """Train a refiner. Killed, it goes on from its checkpoint when called again with the same options."""
     check_json(json_file)
     torch = _torch()
+    from stereokit_refiners.encode import check_form
     from stereokit_refiners.training import Source
     from stereokit_refiners.weights import NETWORKS, read
 
@@ -77,12 +79,22 @@ def train(
     content = None if start is None else read(start)
     if content is not None and content.network != refiner:
         raise OptionError(f"start must hold weights of {refiner!r}, got those of {content.network!r}")
-    _folder(output)
-    held = cache or output / "cache"
     methods = list(method or _MATCHERS)
+    for name in methods:
+        parse_method(name)
+    check_levels(0, max_disparity)
+    check_form(chosen.form, NETWORKS[refiner].forms, refiner)
     everything = [] if dataset is None else list(load(dataset, root))
     groups = _groups(everything, frames, validation, folds)
     more = _extra(extra or ())
+    if dataset is not None and not all(training for training, _ in groups):
+        raise OptionError("frames must leave some to train on beside those held out, got none")
+    for frame in (*more.values(), *(f for pair in groups for part in pair for f in part)):
+        if frame.noc is None and frame.occ is None:
+            raise InputError(f"frame {frame.name} has no ground truth to train on")
+    held = output / "cache" if cache is None else cache
+    make_folder("cache", held)
+    make_folder("output", output)
     world = _join_group(torch)
 
     def samples(which: Sequence[Frame], numbers: range, step: Callable[..., None]) -> list[Any]:
@@ -118,9 +130,9 @@ def train(
         scenes = street_samples(step)
     results = []
     for number, (training, held_out) in enumerate(groups):
-        sources = [Source(scenes, street_share if training else 1.0)] if scenes else []
         names = [*(frame.name for frame in training), *more]
         mine = [sample for name in names for sample in maps[name]]
+        sources = [Source(scenes, street_share if mine else 1.0)] if scenes else []
         if mine:
             sources.append(Source(mine, 1 - street_share if scenes else 1.0))
         folder = output if folds is None else output / f"fold-{number}"
@@ -189,13 +201,6 @@ def _extra(given: Sequence[str]) -> dict[str, Frame]:
     return frames
 
 
-def _folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"output must be a folder, got {str(path)!r} ({error.strerror or error})") from error
-
-
 def _join_group(torch: Any) -> tuple[int, int]:
     """Join the processes that torchrun started; return this one's number, and how many there are."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
@@ -214,6 +219,7 @@ def _train_one(
     from stereokit_refiners.weights import NETWORKS, WeightFile, write
 
     network = NETWORKS[refiner]
+    make_folder("output", folder)
     with progress(settings.steps) as (_, step):
         at = 0
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.io import write_bytes
+from stereokit.io import make_folder, write_bytes
 from stereokit_evaluation.frames import Frame
 from stereokit_evaluation.scenes import generate
 from stereokit_refiners.samples import Pair
@@ -64,7 +64,7 @@ def scene_pair(seed: int, cache: Path | None = None) -> Pair:
         if path is not None:
             buffer = io.BytesIO()
             np.savez(buffer, allow_pickle=False, **content)
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder("cache", path.parent)
             write_bytes(path, buffer.getvalue())
     noc, occ = (_decoded(content[name]) for name in ("noc", "occ"))
     return Pair(f"street-{seed}", content["left"], content["right"], noc, occ)

@@ -53,7 +53,7 @@ def compose(
     elif name == "stereokit":
         corrected = np.empty(coarse.shape, np.float32)
         run([partial(_correct, head, coarse, y0, y1, corrected) for y0, y1 in spans(len(coarse), threads)], threads)
-        held = [np.empty(4 * len(OFFSETS), np.float32) for _ in parts]
+        held = [np.empty(4 * len(OFFSETS) + 4, np.float32) for _ in parts]
         tasks = [partial(_mix, head, corrected, _DY, _DX, y0, y1, held[k], out) for k, (y0, y1) in enumerate(parts)]
     else:
         tasks = [partial(_correct_upscaled, head, coarse, y0, y1, out) for y0, y1 in parts]
@@ -107,11 +107,11 @@ def _correct(
 
 @inline
 def _exponential(x: Any) -> Any:
-    """Return e**x for moderate x, to about 1e-7: 2**n from the bits of n, and a polynomial for the rest.
+    """Return p and n with ``p * 2**n = e**x`` to about 1e-7, for x from -80 to 0: p is a polynomial.
 
     Single IEEE operations, so that it becomes vector code and is the same everywhere.
     """
-    x = min(max(x, np.float32(-40)), np.float32(40)) * np.float32(1.4426950408889634)
+    x = max(x, np.float32(-80)) * np.float32(1.4426950408889634)
     whole = np.floor(x + np.float32(0.5))
     z = (x - whole) * np.float32(0.6931471805599453)
     p = np.float32(1 / 720)
@@ -136,10 +136,17 @@ def _mix(
     for y in range(y0, y1):
         for x in range((out.shape[1] + 1) // 2):
             pixel = head[y, x]
-            for k in range(4 * count):
-                fraction, power = _exponential(pixel[5 + k])
-                share[k] = fraction
-                bits[k] += power << np.int32(23)
+            peak = share[4 * count :]  # the largest logit of each phase
+            for phase in range(4):
+                peak[phase] = pixel[5 + phase]
+            for k in range(1, count):
+                for phase in range(4):
+                    peak[phase] = max(peak[phase], pixel[5 + 4 * k + phase])
+            for k in range(count):
+                for phase in range(4):
+                    fraction, power = _exponential(pixel[5 + 4 * k + phase] - peak[phase])
+                    share[4 * k + phase] = fraction
+                    bits[4 * k + phase] += power << np.int32(23)
             total_0 = np.float32(0)
             total_1 = np.float32(0)
             total_2 = np.float32(0)

@@ -59,8 +59,8 @@ class Module(nn.Module):
         return self.network.forward(_TorchOps(self), inputs)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return the weights under the names of weight files."""
-        return {_name(key): value.detach().float().cpu().numpy() for key, value in self.weights.items()}
+        """Return a copy of the weights under the names of weight files."""
+        return {_name(key): value.detach().float().cpu().numpy().copy() for key, value in self.weights.items()}
 
     def load(self, arrays: Mapping[str, NDArray[np.float32]]) -> None:
         """Take over the weights of a file."""
@@ -183,20 +183,24 @@ def runner(
     return run
 
 
-def calibrate(module: Module, batches: Iterable[Mapping[str, Tensor]], share: float = 0.9999) -> dict[str, float]:
-    """Return the range of each activation: the largest, over `batches`, of the value that a share of it stays below."""
-    ranges: dict[str, float] = {}
+def calibrate(module: Module, batches: Iterable[Mapping[str, Tensor]], share: float = 0.999) -> dict[str, list[float]]:
+    """Return the range of each channel of each activation.
+
+    It is the largest, over `batches`, of the absolute value that a share of the channel stays below.
+    """
+    ranges: dict[str, Tensor] = {}
 
     class Watching(_TorchOps):
         def activate(self, name: str, x: Tensor) -> Tensor:
             y = super().activate(name, x)
-            size = y.abs().flatten()
-            kept = max(1, round(size.numel() * (1 - share)))
-            ranges[name] = max(ranges.get(name, 0.0), float(size.topk(kept).values[-1]))
+            size = y.abs().transpose(0, 1).flatten(1).float()
+            kept = max(1, round(size.shape[1] * (1 - share)))
+            bound = size.topk(kept, dim=1).values[:, -1]
+            ranges[name] = torch.maximum(ranges[name], bound) if name in ranges else bound
             return y
 
     module.eval()
     with torch.inference_mode():
         for inputs in batches:
             module.network.forward(Watching(module), inputs)
-    return ranges
+    return {name: [float(f"{value:.4g}") for value in bound.tolist()] for name, bound in ranges.items()}

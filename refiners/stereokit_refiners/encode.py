@@ -21,10 +21,11 @@ __all__ = ["FORMS", "check_form", "encode", "half_image"]
 FORMS = ("residual", "literal")
 
 
-def check_form(form: str) -> str:
-    """Return `form`; raise OptionError if there is no such form."""
-    if form not in FORMS:
-        raise OptionError(f"form must be one of {', '.join(FORMS)}, got {form!r}")
+def check_form(form: str, known: tuple[str, ...] = FORMS, network: str = "") -> str:
+    """Return `form`; raise OptionError if it is not one of `known`, those of `network`."""
+    if form not in known:
+        owner = f" of {network!r}" if network else ""
+        raise OptionError(f"form{owner} must be one of {', '.join(known)}, got {form!r}")
     return form
 
 

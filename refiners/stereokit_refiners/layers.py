@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Layer", "Network", "Ops", "Weights", "cost", "shapes", "sub_pixel_kernel", "sub_pixel_taps"]
+__all__ = ["Layer", "Network", "Ops", "Weights", "activations", "cost", "shapes", "sub_pixel_kernel", "sub_pixel_taps"]
 
 T = TypeVar("T")
 Weights = Mapping[str, NDArray[np.float32]]
@@ -104,6 +104,10 @@ class Network(Protocol):
     def multiple(self) -> int:
         """Rows and columns of the input must be multiples of this."""
 
+    @property
+    def forms(self) -> tuple[str, ...]:
+        """Which of `stereokit_refiners.encode.FORMS` it has."""
+
     def forward(self, ops: Ops[Any], inputs: Mapping[str, Any]) -> dict[str, Any]:
         """Return the heads, by name; the map is made of ``"map"`` by the network's output rule (`_compose`)."""
 
@@ -124,6 +128,7 @@ class _Sizes:
         self.layers = {layer.name: layer for layer in network.layers}
         self.macs = 0
         self.seen: dict[str, tuple[int, int, int]] = {}
+        self.activations: dict[str, int] = {}
 
     def conv(self, name: str, inputs: Sequence[tuple[int, int, int]], *, activate: bool = True) -> Any:
         layer = self.layers[name]
@@ -137,10 +142,12 @@ class _Sizes:
             out = layer.outputs, -(-rows // layer.stride), -(-columns // layer.stride)
             self.macs += out[0] * out[1] * out[2] * channels * layer.kernel**2
         self.seen[name] = out
+        if activate:
+            self.activations[name] = layer.outputs
         return out
 
     def conv_split(self, name: str, inputs: Sequence[tuple[int, int, int]]) -> Any:
-        outputs, rows, columns = self.conv(name, inputs)
+        outputs, rows, columns = self.conv(name, inputs, activate=False)
         return 4 * outputs, rows // 2, columns // 2
 
     def sample(self, mean: Any, log_sigma: Any) -> Any:
@@ -155,10 +162,18 @@ class _Sizes:
         return x
 
     def activate(self, name: str, x: Any) -> Any:
+        self.activations[name] = x[0]
         return x
 
     def twice(self, x: Any) -> Any:
         return x[0], 2 * x[1], 2 * x[2]
+
+
+def activations(network: Network) -> dict[str, int]:
+    """Return the channels of each activation of `network`, by name: those of layers, and of sums that are activated."""
+    sizes = _Sizes(network)
+    network.forward(sizes, {name: (channels, 8, 8) for name, channels in network.inputs.items()})
+    return sizes.activations
 
 
 def cost(network: Network, rows: int, columns: int) -> tuple[int, int, dict[str, tuple[int, int, int]]]:

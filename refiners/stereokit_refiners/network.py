@@ -8,6 +8,7 @@ Networks compiled for a size are kept, a few at a time.
 from __future__ import annotations
 
 import importlib.util
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -35,7 +36,7 @@ Run = Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]
 """From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LearnedRefiner:
     """A refiner that is a network.
 
@@ -68,6 +69,8 @@ class LearnedRefiner:
     def __post_init__(self) -> None:
         if self.weights is None and not self.architecture:
             raise OptionError("refiner 'file' needs weights, the path of a .safetensors file, got none")
+        if not isinstance(self.weights, (str, os.PathLike, type(None))):
+            raise OptionError(f"weights must be the path of a .safetensors file, got {self.weights!r}")
         self._use(shipped(self.architecture) if self.weights is None else read(self.weights))
 
     @classmethod
@@ -89,13 +92,21 @@ class LearnedRefiner:
         object.__setattr__(self, "precision", _precision(self.precision, self.backend, content))
         object.__setattr__(self, "_compiled", _Compiled(content, self.backend, self.precision))
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, LearnedRefiner) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
     def __getstate__(self) -> dict[str, Any]:
-        return {"weights": self.weights, "backend": self.backend, "precision": self.precision}
+        names = ("weights", "backend", "precision", "_file")
+        return {name: getattr(self, name) for name in names}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        content = state.pop("_file")
         for name, value in state.items():
             object.__setattr__(self, name, value)
-        self.__post_init__()
+        self._use(content)
 
     @property
     def fingerprint(self) -> str:
@@ -133,21 +144,21 @@ class LearnedRefiner:
         return Disparity(full, known, confidence)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StereoVaeRefiner(LearnedRefiner):
     """StereoVAE (Chang et al. 2023), trained on the maps of S1 to S4."""
 
     architecture: ClassVar[str] = "stereovae"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CnnRefiner(LearnedRefiner):
     """The paper's network without the latent."""
 
     architecture: ClassVar[str] = "cnn"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PyramidRefiner(LearnedRefiner):
     """The network of this project: see `stereokit_refiners.pyramid`."""
 

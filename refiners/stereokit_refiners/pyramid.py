@@ -56,6 +56,7 @@ class Pyramid:
     )
     inputs: ClassVar[dict[str, int]] = {"disparity": 1, "valid": 1, "phases": 4}
     multiple: ClassVar[int] = 8
+    forms: ClassVar[tuple[str, ...]] = ("residual",)
     latent: ClassVar[bool] = False
 
     def forward(self, ops: Ops[Any], inputs: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 import stereokit
 from stereokit.defaults import DEFAULTS
-from stereokit.io import write_bytes
+from stereokit.io import make_folder, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
 
@@ -143,7 +142,7 @@ def crop(sample: Sample, rows: int, columns: int, rng: np.random.Generator) -> C
     twice = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
-        np.pad(part.valid, more),
+        np.pad(part.valid, more, mode="edge"),
         np.pad(left, twice, mode="edge").astype(np.float32),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -158,7 +157,7 @@ def whole(sample: Sample, multiple: int) -> Crop:
     twice = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
-        np.pad(part.valid, more),
+        np.pad(part.valid, more, mode="edge"),
         np.pad(part.left, twice, mode="edge"),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -225,7 +224,7 @@ def _rescaled(
     shrinks = across < 1 and down < 1
     images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR) for i in (left, right)]
     factor = np.float32(size[0] / columns)
-    maps = [cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) * factor for m in (noc, occ)]
+    maps = [cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT) * factor for m in (noc, occ)]
     return images[0], images[1], maps[0], maps[1]
 
 
@@ -283,6 +282,6 @@ def load_variant(
     if path is not None:
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **{k: np.asarray(v) for k, v in vars(sample).items()})
-        os.makedirs(path.parent, exist_ok=True)
+        make_folder("cache", path.parent)
         write_bytes(path, buffer.getvalue())
     return sample

@@ -10,8 +10,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import os
 import time
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
@@ -23,8 +23,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stereokit.errors import OptionError
-from stereokit.io import write_bytes
+from stereokit.errors import FileError, OptionError
+from stereokit.inputs import check_flag, check_integer, check_number
+from stereokit.io import make_folder, write_bytes
 from stereokit_refiners._torch import Module, calibrate, compose
 from stereokit_refiners.encode import check_form, encode
 from stereokit_refiners.layers import Network, Weights
@@ -98,14 +99,22 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_form(self.form)
-        for loss in (self.loss, self.finish or self.loss):
+        for loss in (self.loss, self.loss if self.finish is None else self.finish):
             if loss not in LOSSES:
                 raise OptionError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
         if self.schedule not in ("cosine", "paper"):
             raise OptionError(f"schedule must be cosine or paper, got {self.schedule!r}")
         for name in ("steps", "batch", "rows", "columns", "epoch", "evaluate_every"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} must be at least 1, got {getattr(self, name)}")
+            check_integer(name, getattr(self, name), 1)
+        for name in ("seed", "patience"):
+            check_integer(name, getattr(self, name), 0)
+        for name, high in (("learning_rate", 10.0), ("divergence", 1e6), ("decay", 1.0), ("clip", 1e9), ("ema", 1.0)):
+            check_number(name, getattr(self, name), 0, high)
+        if not isinstance(self.betas, (tuple, list)) or len(self.betas) != 2:
+            raise OptionError(f"betas must be two numbers from 0 to 1, got {self.betas!r}")
+        for beta in self.betas:
+            check_number("betas", beta, 0, 0.999999)
+        check_flag("half", self.half)
         if self.rows % 8 or self.columns % 8:
             raise OptionError(f"rows and columns must be multiples of 8, got {self.rows} and {self.columns}")
 
@@ -290,7 +299,9 @@ def fit(
     history : History
     """
     if not sources or not all(source.samples for source in sources):
-        raise OptionError("sources must hold at least one sample each")
+        raise OptionError("sources must hold at least one sample each, got an empty one")
+    check_form(settings.form, network.forms, network.name)
+    identity = _described(network, sources, validation, settings, start, world)
     device = _device()
     module = Module(network, torch.Generator().manual_seed(settings.seed))
     if start is not None:
@@ -305,9 +316,14 @@ def fit(
     )
     history = History()
     first, best, best_arrays, misses = 0, float("inf"), None, 0
+    losses: list[float] = []  # since the last look
     if checkpoint is not None and checkpoint.exists():
-        state = torch.load(checkpoint, map_location=device, weights_only=True)
-        if state["settings"] != _described(network, settings):
+        try:
+            state = torch.load(checkpoint, map_location=device, weights_only=True)
+        except Exception as error:  # of many kinds, by what is broken
+            reason = type(error).__name__
+            raise FileError(f"checkpoint must be one of this program's, got {str(checkpoint)!r} ({reason})") from None
+        if not isinstance(state, dict) or state.get("identity") != identity:
             raise OptionError(
                 f"checkpoint {str(checkpoint)!r} is of other settings; remove it or choose another folder"
             )
@@ -315,7 +331,7 @@ def fit(
         average.load_state_dict(state["average"])
         optimizer.load_state_dict(state["optimizer"])
         history.rows = [tuple(row) for row in state["history"]]
-        first, best, misses = state["step"], state["best"], state["misses"]
+        first, best, misses, losses = state["step"], state["best"], state["misses"], state["losses"]
         best_arrays = {k: v.numpy() for k, v in state["best_arrays"].items()} or None
 
     def save(step: int) -> None:
@@ -324,18 +340,19 @@ def fit(
         buffer = io.BytesIO()
         torch.save(
             {
-                "settings": _described(network, settings), "step": step, "module": module.state_dict(),
+                "identity": identity,
+                "losses": losses, "step": step, "module": module.state_dict(),
                 "average": average.state_dict(), "optimizer": optimizer.state_dict(), "best": best, "misses": misses,
                 "history": [list(row) for row in history.rows],
                 "best_arrays": {k: torch.from_numpy(v) for k, v in (best_arrays or {}).items()},
             },
             buffer,
         )  # fmt: skip
-        os.makedirs(checkpoint.parent, exist_ok=True)
+        make_folder("output", checkpoint.parent)
         write_bytes(checkpoint, buffer.getvalue())
 
     module.train()
-    saved, losses, score = time.monotonic(), [], None
+    saved, score = time.monotonic(), history.rows[-1][2] if history.rows else None
     for step, drawn in _batches(network, sources, settings, first, rank):
         torch.manual_seed((settings.seed * 1_000_003 + step) * world + rank)
         batch = {name: tensor.to(device, non_blocking=True) for name, tensor in drawn.items()}
@@ -371,10 +388,11 @@ def fit(
                     best, best_arrays = score, average.arrays()
         if progress is not None:
             progress(done, float(loss.detach()), score)
-        if time.monotonic() - saved > save_every_s or done == settings.steps:
+        last = done == settings.steps or (settings.patience > 0 and misses >= settings.patience)
+        if last or time.monotonic() - saved > save_every_s:
             save(done)
             saved = time.monotonic()
-        if settings.patience > 0 and misses >= settings.patience:
+        if last:
             break
     return best_arrays or average.arrays(), history
 
@@ -386,7 +404,7 @@ def restored(network: Network, arrays: Weights) -> Module:
     return module.eval()
 
 
-def calibrated(module: Module, form: str, sources: Sequence[Source], count: int = 24) -> dict[str, float]:
+def calibrated(module: Module, form: str, sources: Sequence[Source], count: int = 24) -> dict[str, list[float]]:
     """Return the ranges of the activations for int8, over whole samples taken evenly from `sources`."""
     batches = []
     for source in sources:
@@ -396,5 +414,27 @@ def calibrated(module: Module, form: str, sources: Sequence[Source], count: int 
     return calibrate(module, ({name: b[name] for name in module.network.inputs} for b in batches))
 
 
-def _described(network: Network, settings: Settings) -> dict[str, Any]:
-    return {"network": network.name, **{k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()}}
+def _described(
+    network: Network, sources: Sequence[Source], validation: Sequence[Sample], settings: Settings,
+    start: Weights | None, world: int,
+) -> dict[str, Any]:  # fmt: skip
+    """Return all that a training depends on, for the checkpoint."""
+
+    def digest(samples: Sequence[Sample]) -> int:
+        found = 0
+        for sample in samples:
+            for array in (sample.coarse, sample.left, sample.truth):
+                found = zlib.crc32(array.tobytes(), found)
+        return found
+
+    begun = 0
+    for name in sorted(start or {}):
+        begun = zlib.crc32((start or {})[name].tobytes(), begun)
+    return {
+        "network": network.name,
+        "settings": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()},
+        "sources": [[float(source.weight), digest(source.samples)] for source in sources],
+        "validation": digest(validation),
+        "start": begun,
+        "world": world,
+    }

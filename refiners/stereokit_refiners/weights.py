@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -19,8 +20,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError, did_you_mean
 from stereokit.io import write_bytes
-from stereokit_refiners.encode import FORMS
-from stereokit_refiners.layers import Network, shapes
+from stereokit_refiners.layers import Network, activations, shapes
 from stereokit_refiners.pyramid import Pyramid
 from stereokit_refiners.stereovae import NonVae, StereoVae
 
@@ -42,8 +42,8 @@ class WeightFile:
         Architecture.
     form : {"residual", "literal"}
     arrays : dict of float32 arrays
-    ranges : dict of float
-        Largest absolute value of each activation, for int8; empty when it was not calibrated.
+    ranges : dict of lists of float
+        Largest absolute value of each channel of each activation, for int8; empty when it was not calibrated.
     notes : dict
         How it was trained: free, JSON.
     """
@@ -51,7 +51,7 @@ class WeightFile:
     network: str
     form: str
     arrays: Mapping[str, NDArray[np.float32]]
-    ranges: Mapping[str, float] = field(default_factory=dict)
+    ranges: Mapping[str, list[float]] = field(default_factory=dict)
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -95,12 +95,12 @@ def write(path: str | Path, content: WeightFile) -> None:
     FileError
         If the arrays are not those of the network, or the file cannot be written.
     """
-    _check(str(path), content.network, content.arrays)
+    _check(str(path), content.network, content.form, content.arrays, content.ranges)
     metadata = {
         "format": _FORMAT,
         "network": content.network,
         "form": content.form,
-        "ranges": json.dumps({name: float(bound) for name, bound in content.ranges.items()}, sort_keys=True),
+        "ranges": json.dumps(dict(content.ranges), sort_keys=True),
         "notes": json.dumps(content.notes, sort_keys=True),
     }
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in content.arrays.items()}
@@ -128,14 +128,12 @@ def read(path: str | Path) -> WeightFile:
     if metadata.get("format") != _FORMAT:
         raise FileError(f"weights must have the format {_FORMAT!r}, got {metadata.get('format')!r} in {text!r}")
     name, form = metadata.get("network", ""), metadata.get("form", "")
-    if form not in FORMS:
-        raise FileError(f"form of the weights must be one of {', '.join(FORMS)}, got {form!r} in {text!r}")
-    _check(text, name, arrays)
     try:
-        ranges = {str(k): float(v) for k, v in json.loads(metadata.get("ranges", "{}")).items()}
+        ranges = {str(k): [float(x) for x in v] for k, v in json.loads(metadata.get("ranges", "{}")).items()}
         notes = dict(json.loads(metadata.get("notes", "{}")))
     except (ValueError, TypeError, AttributeError):
         raise FileError(f"weights must hold ranges and notes as JSON, got something else in {text!r}") from None
+    _check(text, name, form, arrays, ranges)
     return WeightFile(name, form, arrays, ranges, notes)
 
 
@@ -153,8 +151,21 @@ def shipped(name: str) -> WeightFile:
     return read(str(path))
 
 
-def _check(path: str, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    wanted = shapes(network_named(name))
+def _check(
+    path: str, name: str, form: str, arrays: Mapping[str, NDArray[Any]], ranges: Mapping[str, list[float]]
+) -> None:
+    """Raise FileError unless all of it fits the architecture."""
+    network = network_named(name)
+    if form not in network.forms:
+        raise FileError(f"form of {name!r} must be one of {', '.join(network.forms)}, got {form!r} in {path!r}")
+    channels = activations(network)
+    for key, bounds in ranges.items():
+        if key not in channels:
+            raise FileError(f"ranges must be of activations of {name!r}, got {key!r} in {path!r}")
+        if len(bounds) != channels[key] or not all(math.isfinite(b) and b >= 0 for b in bounds):
+            rule = f"{channels[key]} finite numbers of at least 0"
+            raise FileError(f"range of {key!r} must be {rule}, got {bounds} in {path!r}")
+    wanted = shapes(network)
     missing, unknown = sorted(set(wanted) - set(arrays)), sorted(set(arrays) - set(wanted))
     if missing or unknown:
         what = f"lacks {missing[0]!r}" if missing else f"has an unknown {unknown[0]!r}"

@@ -11,18 +11,20 @@ along the row, and selects. The two never meet in a row, so two threads give wha
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.aggregation._paths import PathBuffers, finish_row, first_visit, prepare_rows, start
-from stereokit.costs.rows import Cost, Levels
+from stereokit.aggregation._paths import CHUNK, PathBuffers, Penalties, finish_part, first_visit, prepare_rows, start
+from stereokit.costs.rows import WORST, Cost, Levels
 from stereokit.errors import OptionError
 from stereokit.inputs import check_integer, check_number
 from stereokit.kernels.jit import kernel
-from stereokit.kernels.pool import run
+from stereokit.kernels.pool import run_stages
 from stereokit.kernels.simd import LANES, load, store
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
@@ -69,8 +71,8 @@ class Sgm:
         check_number("edge", self.edge, 0, 1e6)
         check_number("edge_factor", self.edge_factor, 0, 1)
 
-    def penalties(self, cost_max: int, unit: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return P1 and P2 by grey difference between the two pixels of a step, in steps of cost, each (256,).
+    def penalties(self, cost_max: int, unit: int) -> Penalties:
+        """Return P1 and P2 in steps of cost.
 
         Raises
         ------
@@ -84,10 +86,10 @@ class Sgm:
         if cost_max + round(p2 * unit) > 255 and self.p2 is not None:
             raise OptionError(f"p2 must be at most {(255 - cost_max) / unit:.4g} with this cost, got {p2:g}")
         high = min(round(p2 * unit), 255 - cost_max)
-        steps = np.array([min(round(p1 * unit), high), high])
-        factors = np.where(np.arange(256) < self.edge, 1.0, self.edge_factor)
-        low, high_table = (np.rint(step * factors).astype(np.uint8) for step in steps)
-        return low, np.maximum(high_table, low)
+        low = min(round(p1 * unit), high)
+        at_edge = (np.uint8(np.rint(step * self.edge_factor)) for step in (low, high))
+        edge = np.int16(min(math.ceil(self.edge), 256))  # 256: no two grey levels are so far apart
+        return Penalties(edge, np.uint8(low), np.uint8(high), *at_edge)
 
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
@@ -114,72 +116,88 @@ class Sgm:
         total : (H, W, P) uint16 or None
             Where the sums over all paths go, if they are wanted.
         """
-        p1, p2 = self.penalties(cost.cost_max, cost.unit)
-        height, width = guide.shape
+        height = guide.shape[0]
+        key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.dear
+        penalties, sums, workers = workspace.once(
+            "sgm", key, lambda: self._buffers(guide.shape, levels, cost, workspace)
+        )
+        keep = np.empty(0, np.uint16) if total is None else total.reshape(-1)
+        if len(workers) == 1:
+            start(workers[0])
+            _last_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out, keep)
+            return
+        middle = height // 2
+
+        def first(k: int, y0: int, y1: int) -> None:
+            start(workers[k])
+            first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums)
+
+        def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
+            _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, keep)
+
+        run_stages(
+            [
+                [partial(first, 0, 0, middle), partial(first, 1, height - 1, middle - 1)],
+                [partial(last, 0, middle, height, 1, middle), partial(last, 1, middle - 1, -1, -1, height - middle)],
+            ],
+            threads,
+        )
+
+    def _buffers(
+        self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace
+    ) -> tuple[Penalties, NDArray[Any], list[PathBuffers]]:
+        """Return the penalties, the volume of sums and the buffers of each sweep."""
+        penalties = self.penalties(cost.cost_max, cost.unit)
+        height, width = shape
         size = width * levels.padded
         diagonals = self.paths != 4
-        most = int(p2.max())
+        most = int(max(penalties.p2, penalties.p2_edge))
         sums_dtype = np.uint8 if (3 if diagonals else 1) * most <= 255 else np.uint16
         across_dtype = np.uint8 if 2 * most <= 255 else np.uint16
         both = self.paths != 5
         sums = workspace.array("sgm.sums", height * size if both else 1, sums_dtype)
-        keep = np.empty(0, np.uint16) if total is None else total.reshape(-1)
-        workers = []
-        for k in range(2 if both else 1):
-            buffers = PathBuffers(
+        kept = workspace.array("sgm.kept", height * width if self.paths == 4 and cost.dear else 0, np.uint8)
+        padding = np.zeros(levels.padded, np.uint8)
+        padding[levels.count :] = WORST
+        workers = [
+            PathBuffers(
                 tuple(range(levels.padded // LANES)),
                 diagonals,
                 self.paths,
                 width,
+                self.paths == 4 and 4 * cost.cost_max + most <= 255,
+                (5 if diagonals else 3) * most + (cost.cost_max if kept.size else 0) <= 255,
                 workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
                 workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
                 workspace.array(f"sgm.chains{k}", 4 * levels.padded, np.uint8),
                 workspace.array(f"sgm.state{k}", 3 * size, np.uint8),
                 workspace.array(f"sgm.least{k}", 3 * width, np.uint8),
                 workspace.array(f"sgm.penalties{k}", 16 * width, np.uint8),
-                workspace.array(f"sgm.total{k}", size, np.uint16),
+                workspace.array(f"sgm.total{k}", CHUNK * levels.padded, np.uint16),
+                kept,
+                padding,
             )
-            start(buffers)
-            workers.append(buffers)
-        if not both:
-            _last_visit(rows[0], workers[0], guide, p1, p2, 0, height, 1, 0, sums, False, out, keep)
-            return
-        middle = height // 2
-        a, b = workers
-        run(
-            [
-                lambda: first_visit(rows[0], a, guide, p1, p2, 0, middle, sums),
-                lambda: first_visit(rows[1], b, guide, p1, p2, height - 1, middle - 1, sums),
-            ],
-            threads,
-        )
-        run(
-            [
-                lambda: _last_visit(rows[0], a, guide, p1, p2, middle, height, 1, middle, sums, True, out, keep),
-                lambda: _last_visit(
-                    rows[1], b, guide, p1, p2, middle - 1, -1, -1, height - middle, sums, True, out, keep
-                ),
-            ],
-            threads,
-        )
+            for k in range(2 if both else 1)
+        ]
+        return penalties, sums, workers
 
 
 @kernel
 def _last_visit(
-    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], p1: NDArray[np.uint8], p2: NDArray[np.uint8],
-    y0: int, y1: int, step: int, k0: int, sums: NDArray[Any], stored: bool, out: Winners,
-    total: NDArray[np.uint16],
+    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, step: int,
+    k0: int, sums: NDArray[Any], stored: bool, out: Winners, total: NDArray[np.uint16],
 ) -> None:  # fmt: skip
     padded = LANES * len(buffers.blocks)
-    size = buffers.width * padded
     visits = abs(y1 - y0)
     for k in range(visits):
         y = y0 + k * step
         slot = k % 2
         if slot == 0:
-            prepare_rows(rows, buffers, guide, p1, p2, y, step, min(2, visits - k))
-        finish_row(buffers, slot, y, k0 + k, sums, stored)
-        if total.size > 0:
-            for at in range(0, size, LANES):
-                store(total, y * size + at, load(buffers.total, at))
-        select_row(buffers.total, buffers.total, buffers.width, buffers.blocks, y * buffers.width, out)
+            prepare_rows(rows, buffers, guide, penalties, y, step, min(2, visits - k), sums)
+        for x0 in range(0, buffers.width, CHUNK):
+            x1 = min(x0 + CHUNK, buffers.width)
+            finish_part(buffers, slot, y, k0 + k, x0, x1, sums, stored)
+            if total.size > 0:
+                for at in range(0, (x1 - x0) * padded, LANES):
+                    store(total, (y * buffers.width + x0) * padded + at, load(buffers.total, at))
+            select_row(buffers.total, buffers.total, x1 - x0, buffers.blocks, y * buffers.width + x0, out)

@@ -5,6 +5,10 @@ match is the number of bits that differ. All neighbours of the window count (62 
 
 The bits are kept as byte planes, eight neighbours to a plane: then the Hamming distances of 64 levels are, plane
 by plane, one load, one exclusive or, one population count and one addition of bytes.
+
+Bound and measurement: 5x5 has 3 planes, so 64 cells take 9 operations on 512-bit vectors, 3 loads and a store, or
+1.2 ms for 1242x375 with 128 levels on one thread of a Zen 4 at two operations per cycle of 3.65 GHz and 1.9 ms for the
+loads and stores; measured 2.5 ms.
 """
 
 from __future__ import annotations
@@ -68,6 +72,11 @@ class Census:
     def unit(self) -> int:
         """Penalties are given in neighbours that differ: one unit of cost."""
         return 1
+
+    @property
+    def dear(self) -> bool:
+        """Whether a row costs more to compute again than to bring back from a volume."""
+        return self.window == "9x7"
 
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[CensusRows]:
         """Transform both images; return the row producers of `workers` sweeps."""

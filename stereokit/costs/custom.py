@@ -54,6 +54,11 @@ class RowCost:
         """Penalties are given in units of cost."""
         return 1
 
+    @property
+    def dear(self) -> bool:
+        """Whether a row costs more to compute again than to bring back from a volume."""
+        return False
+
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[VolumeRows]:
         """Compute the cost volume; return its rows for `workers` sweeps."""
         height, width = pair.left.shape

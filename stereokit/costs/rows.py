@@ -109,6 +109,10 @@ class Cost(Protocol):
     def unit(self) -> int:
         """Steps of cost per unit in which users give penalties."""
 
+    @property
+    def dear(self) -> bool:
+        """Whether a row costs more to compute again than to bring back from a volume."""
+
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[Any]:
         """Prepare an image pair; return a row producer, a named tuple, for each of `workers` sweeps."""
 
@@ -149,7 +153,14 @@ def implements(kind: type) -> Callable[[Callable[..., None]], Callable[..., None
 
 
 def cells_of(pair: Pair, cost_max: int, workspace: Workspace) -> Cells:
-    """Return the evidence of `pair` for a cost whose range is ``0..cost_max``."""
+    """Return the evidence of `pair` for a cost whose range is ``0..cost_max``; that of whole images is kept."""
+    if pair.left_bad is not None or pair.right_bad is not None:
+        return _new_cells(pair, cost_max, Workspace())
+    key = pair.left.shape, pair.levels, pair.outside, cost_max
+    return workspace.once("cells", key, lambda: _new_cells(pair, cost_max, Workspace()))
+
+
+def _new_cells(pair: Pair, cost_max: int, workspace: Workspace) -> Cells:
     height, width = pair.left.shape
     levels = pair.levels
     outside = np.uint8(cost_max if pair.outside is None else round(pair.outside * cost_max))

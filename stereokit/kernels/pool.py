@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 
-__all__ = ["available_threads", "run", "spans"]
+from stereokit.kernels.gate import meet, new_gate, open_for_good
+
+__all__ = ["available_threads", "crew", "run", "run_stages", "spans"]
 
 _lock = threading.Lock()
 _executor: ThreadPoolExecutor | None = None
@@ -43,11 +46,6 @@ if hasattr(os, "register_at_fork"):  # a forked child has no worker threads: it 
     os.register_at_fork(after_in_child=_forget_executor)
 
 
-def _run_all(tasks: Sequence[Callable[[], object]]) -> None:
-    for task in tasks:
-        task()
-
-
 def _wait_for(others: list[Future[None]]) -> None:
     """Wait until all have ended, however often the user interrupts: until then they write to borrowed buffers."""
     interrupted: KeyboardInterrupt | None = None
@@ -61,24 +59,109 @@ def _wait_for(others: list[Future[None]]) -> None:
         raise interrupted
 
 
-def run(tasks: Sequence[Callable[[], object]], threads: int) -> None:
+Task = Callable[[], object]
+
+
+def run(tasks: Sequence[Task], threads: int) -> None:
     """Run all `tasks`, at most `threads` at a time, and return when all have ended.
 
     The calling thread does its share. The first exception of any task is raised again. A task must not call
     `run` itself.
     """
-    count = min(threads, len(tasks))
-    if count <= 1:
-        _run_all(tasks)
+    run_stages([tasks], threads)
+
+
+def run_stages(stages: Sequence[Sequence[Task]], threads: int) -> None:
+    """Run the tasks of each stage, at most `threads` at a time, when all of the stage before have ended.
+
+    With two threads the work is handed over once, or not at all within `crew`, and the two meet at a gate between
+    stages.
+    """
+    stages = [stage for stage in stages if len(stage) > 0]
+    count = min(threads, max(map(len, stages), default=0))
+    if count == 2:
+        held: _Crew | None = getattr(_local, "crew", None)
+        if held is not None:
+            held.run(stages)
+        else:
+            with crew(2):
+                _local.crew.run(stages)
         return
-    pool = _shared_executor()
-    others = [pool.submit(_run_all, tasks[k::count]) for k in range(1, count)]
+    # Those who meet at a gate must all be running. More than two might wait in the pool's queue, behind members of
+    # other gates that wait for members in the queue; a helper that is alone waits for nobody but its caller.
+    for stage in stages:
+        _run_together(stage, min(count, len(stage)))
+
+
+def _run_together(tasks: Sequence[Task], count: int) -> None:
+    def work(k: int) -> None:
+        for task in tasks[k::count]:
+            task()
+
+    pool = _shared_executor() if count > 1 else None
+    others = [] if pool is None else [pool.submit(work, k) for k in range(1, count)]
     try:
-        _run_all(tasks[0::count])
+        work(0)
     finally:
         _wait_for(others)
     for other in others:
         other.result()
+
+
+_local = threading.local()  # .crew: the helper that the thread has borrowed
+
+
+class _Crew:
+    """The calling thread and one helper, which waits at a gate for the next stages."""
+
+    def __init__(self) -> None:
+        self.gate = new_gate()
+        self.stages: Sequence[Sequence[Task]] = ()
+        self.helper = _shared_executor().submit(self._help)
+
+    def _help(self) -> None:
+        try:
+            while meet(self.gate, 2) and self.stages and self._work(1):
+                pass
+        except BaseException:
+            open_for_good(self.gate)
+            raise
+
+    def _work(self, k: int) -> bool:
+        """Do the `k`-th member's share; return False if the other one failed."""
+        for stage in self.stages:
+            for task in stage[k::2]:
+                task()
+            if not meet(self.gate, 2):
+                return False
+        return True
+
+    def run(self, stages: Sequence[Sequence[Task]]) -> None:
+        self.stages = stages
+        if not (meet(self.gate, 2) and self._work(0)):
+            self.helper.result()
+
+
+@contextmanager
+def crew(threads: int) -> Iterator[None]:
+    """Keep one helper at hand for all `run` and `run_stages` with two threads in a ``with`` block.
+
+    It uses its processor even while it waits: the block must not do anything else that takes long.
+    """
+    if threads != 2 or getattr(_local, "crew", None) is not None:
+        yield
+        return
+    held = _Crew()
+    _local.crew = held
+    try:
+        yield
+    except BaseException:
+        open_for_good(held.gate)
+        _wait_for([held.helper])  # it may be in the midst of a task
+        raise
+    finally:
+        _local.crew = None
+        open_for_good(held.gate)
 
 
 def spans(length: int, parts: int) -> list[tuple[int, int]]:

@@ -17,11 +17,12 @@ Layout of a row of costs or path costs (one row of the image, `W` pixels, `D` di
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
-from numba import types
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
@@ -31,25 +32,29 @@ __all__ = [
     "add",
     "add_saturated",
     "aligned",
+    "bits_of",
     "choose",
     "convert",
     "count_bits",
     "either",
     "first_bit",
+    "first_lane",
     "less_bit",
     "load",
     "lowest",
-    "lowest_of_3",
+    "lowest_of_4",
     "mask_equal",
     "maximum",
     "minimum",
     "multiply",
     "multiply_high",
+    "multiply_pairs",
     "shift_down",
     "shift_left",
     "shift_right",
     "shift_up",
     "splat",
+    "splat_at",
     "store",
     "subtract",
     "vector_bits",
@@ -158,6 +163,18 @@ def splat(typing: Any, scalar: Any) -> Any:
     return kind(scalar), generate
 
 
+@intrinsic
+def splat_at(typing: Any, array: Any, offset: Any) -> Any:
+    """Return a vector whose lanes all hold element `offset` of the flat `array`; `offset` is not negative."""
+    kind = Vector(array.dtype)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return _splat_ir(builder, builder.load(builder.gep(data, [args[1]])), kind)
+
+    return kind(array, types.intp), generate
+
+
 def _binary(name: str, doc: str, integer: Any, floating: Any = None) -> Any:
     def define(typing: Any, a: Any, b: Any) -> Any:
         if not isinstance(a, Vector) or a != b or (a.is_float and floating is None):
@@ -236,6 +253,23 @@ def count_bits(typing: Any, value: Any) -> Any:
     return value(value), generate
 
 
+def _low_bytes(builder: Any, value: Any) -> Any:
+    """Cut ``int32`` lanes to bytes in two rounds of shuffles, which cost a third of what LLVM makes of a plain cut."""
+
+    def shuffle(x: Any, y: Any, lanes: Any) -> Any:
+        return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(_I32, len(lanes)), list(lanes)))
+
+    def halves(parts: list[Any], bits: int) -> list[Any]:
+        kind = ir.VectorType(ir.IntType(bits), LANES * 8 // bits)
+        odd = 0 if sys.byteorder == "little" else 1
+        lanes = range(odd, 2 * kind.count, 2)
+        parts = [builder.bitcast(part, kind) for part in parts]
+        return [shuffle(parts[k], parts[k + 1], lanes) for k in range(0, len(parts), 2)]
+
+    quarters = [shuffle(value, value, range(at, at + LANES // 4)) for at in range(0, LANES, LANES // 4)]
+    return halves(halves(quarters, 16), 8)[0]
+
+
 @intrinsic
 def convert(typing: Any, value: Any, like: Any) -> Any:
     """Return `value` with its lanes converted to the scalar type of `like` (a scalar; its value is unused).
@@ -253,11 +287,63 @@ def convert(typing: Any, value: Any, like: Any) -> Any:
             return (builder.sitofp if value.scalar.signed else builder.uitofp)(source, target.llvm)
         if target.scalar.bitwidth > value.scalar.bitwidth:
             return (builder.sext if value.scalar.signed else builder.zext)(source, target.llvm)
+        if target.scalar.bitwidth == 8 and value.scalar.bitwidth == 32:
+            return _low_bytes(builder, source)
         if target.scalar.bitwidth < value.scalar.bitwidth:
             return builder.trunc(source, target.llvm)
         return source
 
     return target(value, like), generate
+
+
+@intrinsic
+def bits_of(typing: Any, value: Any) -> Any:
+    """Return the bits of ``float32`` lanes as ``int32``."""
+    result = Vector(types.int32)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], result.llvm)
+
+    return result(value), generate
+
+
+@intrinsic
+def multiply_pairs(typing: Any, a: Any, b: Any) -> Any:
+    """Return ``low(a) * low(b) + high(a) * high(b)`` of ``int32`` lanes that hold two ``int16`` each, wrapping.
+
+    Processors of x86 have one instruction for it, of which LLVM must be told; others get the plain form.
+    """
+    if a != Vector(types.int32) or b != a:
+        return None
+    kind = a.llvm
+
+    def plain(builder: Any, x: Any, y: Any) -> Any:
+        half = ir.Constant(kind, [16] * LANES)
+        low = [builder.ashr(builder.shl(v, half), half) for v in (x, y)]
+        high = [builder.ashr(v, half) for v in (x, y)]
+        return builder.add(builder.mul(*low), builder.mul(*high))
+
+    def by_parts(builder: Any, name: str, count: int, x: Any, y: Any) -> Any:
+        def part(v: Any, at: int) -> Any:
+            lanes = ir.Constant(ir.VectorType(_I32, count), list(range(at, at + count)))
+            return builder.bitcast(builder.shuffle_vector(v, v, lanes), ir.VectorType(ir.IntType(16), 2 * count))
+
+        starts = range(0, LANES, count)
+        parts = [_call(builder, name, ir.VectorType(_I32, count), [part(x, at), part(y, at)]) for at in starts]
+        while len(parts) > 1:
+            size = 2 * parts[0].type.count
+            lanes = ir.Constant(ir.VectorType(_I32, size), list(range(size)))
+            parts = [builder.shuffle_vector(parts[k], parts[k + 1], lanes) for k in range(0, len(parts), 2)]
+        return parts[0]
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if not binding.get_process_triple().startswith("x86_64"):
+            return plain(builder, *args)
+        bits = vector_bits() if config.CPU_NAME is None else 128  # every x86_64 has 128
+        name = {512: "llvm.x86.avx512.pmaddw.d.512", 256: "llvm.x86.avx2.pmadd.wd", 128: "llvm.x86.sse2.pmadd.wd"}[bits]
+        return by_parts(builder, name, bits // 32, *args)
+
+    return a(a, b), generate
 
 
 def _shift(name: str, doc: str, build: Any) -> Any:
@@ -317,11 +403,12 @@ def lowest(typing: Any, value: Any) -> Any:
 
 
 @intrinsic
-def lowest_of_3(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return the smallest lanes of three ``uint8`` vectors in the three low bytes of a ``uint32``.
+def lowest_of_4(typing: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Return, for each of four ``uint8`` vectors, a vector whose lanes all hold its smallest lane.
 
-    One tree for the three costs hardly more than one alone: the vectors are interleaved as they are halved.
+    One tree for the four costs hardly more than one alone: the vectors are interleaved as they are halved.
     """
+    result = types.UniTuple(a, 4)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def shuffle(x: Any, y: Any, lanes: list[int]) -> Any:
@@ -343,18 +430,28 @@ def lowest_of_3(typing: Any, a: Any, b: Any, c: Any) -> Any:
         def zip_least(x: Any, y: Any, size: int) -> Any:
             return least(shuffle(x, y, unpack(size, False)), shuffle(x, y, unpack(size, True)))
 
-        first, second, third = args
-        value = zip_least(zip_least(first, second, 1), zip_least(third, third, 1), 2)  # a b c c  a b c c ...
+        first, second, third, fourth = args
+        value = zip_least(zip_least(first, second, 1), zip_least(third, fourth, 1), 2)  # a b c d  a b c d ...
         for n in (32, 16):
             none = ir.Constant(value.type, ir.Undefined)
             value = least(shuffle(value, none, list(range(n))), shuffle(value, none, list(range(n, 2 * n))))
         for n in (8, 4):
             none = ir.Constant(value.type, ir.Undefined)
             value = least(value, shuffle(value, none, [(n + i) % 16 for i in range(16)]))
-        packed = builder.bitcast(value, ir.VectorType(_I32, 4))
-        return builder.extract_element(packed, ir.Constant(_I32, 0))
+        none = ir.Constant(value.type, ir.Undefined)
+        return context.make_tuple(builder, result, [shuffle(value, none, [n] * LANES) for n in range(4)])
 
-    return types.uint32(a, b, c), generate
+    return result(a, b, c, d), generate
+
+
+@intrinsic
+def first_lane(typing: Any, value: Any) -> Any:
+    """Return lane 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.extract_element(args[0], ir.Constant(_I32, 0))
+
+    return value.scalar(value), generate
 
 
 @intrinsic

@@ -7,9 +7,9 @@ several threads never share a buffer and a steady stream of equal frames allocat
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -18,12 +18,15 @@ from stereokit.kernels.simd import aligned
 
 __all__ = ["Pool", "Workspace"]
 
+T = TypeVar("T")
+
 
 class Workspace:
     """Named arrays, allocated when first asked for and reused while shape and type stay the same."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray[Any, Any]] = {}
+        self._made: dict[str, tuple[Hashable, Any]] = {}
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray[Any, Any]:
         """Return the array called `name`, C-contiguous and 64-byte aligned; its content is whatever it was."""
@@ -33,6 +36,14 @@ class Workspace:
             self._arrays.pop(name, None)  # free the old one before the new one is made
             held = self._arrays[name] = aligned(shape, dtype)
         return held
+
+    def once(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
+        """Return what `make` returned when `name` was last asked for, if that was with the same `key`."""
+        held = self._made.get(name)
+        if held is None or held[0] != key:
+            held = self._made[name] = key, make()
+        made: T = held[1]
+        return made
 
     @property
     def nbytes(self) -> int:

@@ -17,7 +17,7 @@ from stereokit.errors import InputError, UnknownNameError, did_you_mean
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.pool import run, spans
 
-__all__ = ["FILLS", "fill"]
+__all__ = ["FILLS", "fill", "fill_empty_rows", "fill_rows"]
 
 FILLS = ("background", "nearest")
 
@@ -52,14 +52,16 @@ def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: i
     out = np.array(disparity, np.float32, order="C")
     nearest = mode == "nearest"
     parts = spans(out.shape[0], threads)
-    run([partial(_fill_rows, out, y0, y1, nearest) for y0, y1 in parts], threads)
-    _fill_empty_rows(out)
+    run([partial(fill_rows, out, y0, y1, nearest) for y0, y1 in parts], threads)
+    fill_empty_rows(out)
     return out
 
 
 @kernel
-def _fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -> None:
+def fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -> int:
+    """Fill the gaps of rows y0..y1 that have a valid pixel, in place; return how many rows have none."""
     width = disparity.shape[1]
+    empty = 0
     for y in range(y0, y1):
         row = disparity[y]
         last = -1  # the last valid column
@@ -78,12 +80,19 @@ def _fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) 
             last = x
         if last >= 0:
             row[last + 1 :] = row[last]
+        else:
+            empty += 1
+    return empty
 
 
-def _fill_empty_rows(disparity: NDArray[np.float32]) -> None:
+def fill_empty_rows(disparity: NDArray[np.float32]) -> bool:
+    """Fill rows without any valid pixel from the nearest, in place; return False if all are such rows."""
     empty = np.isnan(disparity[:, 0])
-    if not empty.any() or empty.all():
-        return
+    if not empty.any():
+        return True
+    if empty.all():
+        return False
     full = np.flatnonzero(~empty)
     for y in np.flatnonzero(empty):
         disparity[y] = disparity[full[np.argmin(np.abs(full - y))]]
+    return True

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, OptionError
 from stereokit.kernels.jit import kernel
+from stereokit.kernels.workspace import Workspace
 
-__all__ = ["median"]
+__all__ = ["median", "median_rows"]
 
 
 def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]:
@@ -41,19 +42,38 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
     if disparity.ndim != 2:
         raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
     source = np.ascontiguousarray(disparity, np.float32)
-    if not np.isnan(source).any():
-        return np.asarray(cv2.medianBlur(source, size), np.float32).reshape(source.shape)
     out = np.empty_like(source)
-    _median_of_valid(source, size // 2, np.empty(size * size, np.float32), out)
+    median_rows(source, size, 0, source.shape[0], out)
     return out
+
+
+def median_rows(
+    source: NDArray[np.float32], size: int, y0: int, y1: int, out: NDArray[np.float32],
+    workspace: Workspace | None = None, dense: bool = False,
+) -> None:  # fmt: skip
+    """Write rows y0..y1 of the filtered map to `out`; the same values however the rows are cut into ranges.
+
+    `dense` promises that no pixel is NaN.
+    """
+    half = size // 2
+    top, bottom = max(y0 - half, 0), min(y1 + half, source.shape[0])
+    part = source[top:bottom]
+    if not dense and np.isnan(part).any():
+        _median_of_valid(source, half, y0, y1, np.empty(size * size, np.float32), out)
+    elif top == y0 and bottom == y1:
+        cv2.medianBlur(part, size, dst=out[y0:y1])
+    else:
+        held = np.empty_like(part) if workspace is None else workspace.array(f"median.{y0}", part.shape, np.float32)
+        cv2.medianBlur(part, size, dst=held)
+        out[y0:y1] = held[y0 - top : y1 - top]
 
 
 @kernel
 def _median_of_valid(
-    source: NDArray[np.float32], half: int, held: NDArray[np.float32], out: NDArray[np.float32]
+    source: NDArray[np.float32], half: int, y0: int, y1: int, held: NDArray[np.float32], out: NDArray[np.float32]
 ) -> None:
     height, width = source.shape
-    for y in range(height):
+    for y in range(y0, y1):
         for x in range(width):
             if np.isnan(source[y, x]):
                 out[y, x] = np.nan

@@ -18,7 +18,7 @@ from stereokit.errors import InputError
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.pool import run, spans
 
-__all__ = ["single_matching_phase"]
+__all__ = ["resolve_rows", "single_matching_phase"]
 
 
 def single_matching_phase(
@@ -48,30 +48,32 @@ def single_matching_phase(
     out = np.array(disparity, np.float32, order="C")
     cost = np.ascontiguousarray(cost)
     parts = spans(out.shape[0], threads)
-    owners = np.empty((len(parts), out.shape[1]), np.int64)
-    run([partial(_resolve, out, cost, y0, y1, owners[k]) for k, (y0, y1) in enumerate(parts)], threads)
+    owners = np.empty((len(parts), out.shape[1]), np.int32)
+    run([partial(resolve_rows, out, cost, y0, y1, owners[k]) for k, (y0, y1) in enumerate(parts)], threads)
     return out
 
 
 @kernel
-def _resolve(disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int, owner: NDArray[np.int64]) -> None:
+def resolve_rows(
+    disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int, owner: NDArray[np.int32]
+) -> None:
+    """Invalidate the losers of rows y0..y1, in place; `owner` has a place for each column."""
     width = disparity.shape[1]
     for y in range(y0, y1):
         row = disparity[y]
         owner[:] = -1
         for x in range(width):
             d = row[x]
-            if not np.isfinite(d):
-                continue
-            xr = np.int64(np.floor(np.float32(x) - d + np.float32(0.5)))
-            if xr < 0 or xr >= width:
+            at = np.float32(x) - d + np.float32(0.5)
+            if not (at >= np.float32(0) and at < np.float32(width)):  # NaN is neither
                 row[x] = np.nan
                 continue
+            xr = np.int64(np.int32(at))
             held = owner[xr]
             if held < 0:
-                owner[xr] = x
+                owner[xr] = np.int32(x)
             elif cost[y, x] < cost[y, held] or (cost[y, x] == cost[y, held] and d > row[held]):
                 row[held] = np.nan
-                owner[xr] = x
+                owner[xr] = np.int32(x)
             else:
                 row[x] = np.nan

@@ -19,7 +19,7 @@ from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["remove_speckles"]
+__all__ = ["erase", "find_regions", "join_rows", "remove_speckles"]
 
 
 def remove_speckles(
@@ -59,11 +59,11 @@ def remove_speckles(
     width = out.shape[1]
     flat = out.reshape(-1)
     parts = spans(out.shape[0], threads)
-    run([partial(_find_regions, flat, width, y0, y1, limit, label, parent, count) for y0, y1 in parts], threads)
+    run([partial(find_regions, flat, width, y0, y1, limit, label, parent, count) for y0, y1 in parts], threads)
     for y0, _ in parts[1:]:
-        _join_rows(out, y0, limit, label, parent, count)
+        join_rows(flat, width, y0, limit, label, parent, count)
     run(
-        [partial(_erase, flat, y0 * width, y1 * width, size, label, parent, count) for y0, y1 in parts],
+        [partial(erase, flat, y0 * width, y1 * width, size, label, parent, count) for y0, y1 in parts],
         threads,
     )
     return out
@@ -86,7 +86,7 @@ def _unite(parent: NDArray[np.int32], count: NDArray[np.int32], a: int, b: int) 
 
 
 @kernel
-def _find_regions(
+def find_regions(
     disparity: NDArray[np.float32], width: int, y0: int, y1: int, limit: np.float32, label: NDArray[np.int32],
     parent: NDArray[np.int32], count: NDArray[np.int32],
 ) -> None:  # fmt: skip
@@ -127,20 +127,18 @@ def _find_regions(
 
 
 @kernel
-def _join_rows(
-    disparity: NDArray[np.float32], y: int, limit: np.float32, label: NDArray[np.int32],
+def join_rows(
+    disparity: NDArray[np.float32], width: int, y: int, limit: np.float32, label: NDArray[np.int32],
     parent: NDArray[np.int32], count: NDArray[np.int32],
 ) -> None:  # fmt: skip
-    """Join the regions of row `y` with those of the row above."""
-    width = disparity.shape[1]
-    for x in range(width):
-        if abs(disparity[y, x] - disparity[y - 1, x]) <= limit:
-            at = y * width + x
+    """Join the regions of row `y` of the flat map with those of the row above."""
+    for at in range(y * width, (y + 1) * width):
+        if abs(disparity[at] - disparity[at - width]) <= limit:
             _unite(parent, count, np.int64(label[at]), np.int64(label[at - width]))
 
 
 @kernel
-def _erase(
+def erase(
     disparity: NDArray[np.float32], start: int, stop: int, size: int, label: NDArray[np.int32],
     parent: NDArray[np.int32], count: NDArray[np.int32],
 ) -> None:  # fmt: skip

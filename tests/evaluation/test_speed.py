@@ -278,6 +278,7 @@ def test_json_has_everything(tmp_path, one_peer):
     assert row["x_3way"] > 0 and row["x_hh"] is None
     assert found["memory"] == found["first_call"] == found["skipped"] == []
     assert found["stages"][0]["ms"]["total"] > 0
+    assert 0 <= found["stages"][0]["allocated_bytes"] < 64_000
     assert found["sizes"][TINY] == {"width": 64, "height": 48, "max_disparity": 16, "opencv_disparities": 16}
     assert found["options"]["threads"] == [1, 2] and found["options"]["images"] == "synthetic"
     assert set(found["versions"]) >= {"stereokit", "numba", "numpy", "opencv", "python"}

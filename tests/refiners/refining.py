@@ -32,6 +32,12 @@ def random_arrays(name, seed=0, last=0.05):
     return arrays
 
 
+def flat_ranges(name, bound, leave=()):
+    """Return one range for all channels of all layers but the last, and of what `leave` names."""
+    layers = NETWORKS[name].layers[:-1]
+    return {layer.name: [float(bound)] * layer.outputs for layer in layers if layer.name not in leave}
+
+
 def random_content(name, seed=0, form="residual", ranges=None, last=0.05):
     return WeightFile(name, form, random_arrays(name, seed, last), ranges or {}, {"note": "random"})
 

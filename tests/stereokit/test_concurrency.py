@@ -8,6 +8,7 @@ import signal
 import textwrap
 import threading
 import time
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -186,11 +187,82 @@ def test_workers_are_waited_for_after_an_interrupt():
         time.sleep(0.5)
         ended.append(True)
 
+    pool.run([lambda: None, lambda: None], 2)  # compiles: numba loses signals meanwhile
     timer = threading.Timer(0.1, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
     timer.start()
     with pytest.raises(KeyboardInterrupt):
         pool.run([lambda: None, slow], 2)
     assert ended == [True]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_steady_stream_of_frames_allocates_nothing_but_the_maps_it_returns(method, threads):
+    pair = pair_of(9, (90, 200))
+    matcher = Matcher(method, max_disparity=32, threads=threads)
+    for _ in range(2):
+        matcher(*pair)
+    held = [matcher(*pair) for _ in range(2)]
+    tracemalloc.start()
+    try:
+        for _ in range(4):
+            tracemalloc.reset_peak()
+            before, _ = tracemalloc.get_traced_memory()
+            result = matcher(*pair)
+            _, peak = tracemalloc.get_traced_memory()
+            returned = result.disparity.nbytes + result.valid.nbytes
+            assert peak - before - returned < 32_000  # objects of python: no map, and less than two rows of levels
+            held.append(result)
+    finally:
+        tracemalloc.stop()
+    for result in held[1:]:
+        np.testing.assert_array_equal(held[0].disparity, result.disparity)
+
+
+def test_maps_that_were_returned_are_not_buffers():
+    matcher = Matcher("census+sgm", max_disparity=16, threads=2)
+    first = matcher(*pair_of(10))
+    kept = first.disparity.copy(), first.valid.copy()
+    matcher(*pair_of(11))
+    np.testing.assert_array_equal(first.disparity, kept[0])
+    np.testing.assert_array_equal(first.valid, kept[1])
+
+
+def test_stages_run_one_after_another_and_fail_together():
+    done = []
+    lock = threading.Lock()
+
+    def note(stage):
+        with lock:
+            done.append(stage)
+
+    for threads in (1, 2, 3):
+        done.clear()
+        pool.run_stages([[lambda n=n: note(n)] * 4 for n in range(5)], threads)
+        assert done == sorted(done) and len(done) == 20
+
+    def fail():
+        raise ValueError("broken")
+
+    for broken in ([fail, lambda: None], [lambda: None, fail]):
+        done.clear()
+        with pytest.raises(ValueError, match="broken"):
+            pool.run_stages([broken, [lambda: note(1)] * 2], 2)
+        assert not done
+    pool.run([lambda: note(0)] * 2, 2)
+    assert done == [0, 0]
+
+
+def test_a_crew_outlives_its_runs_and_a_failure_in_one():
+    done = []
+    with pool.crew(2):
+        for n in range(50):
+            pool.run([lambda n=n: done.append(n), lambda n=n: done.append(n)], 2)
+    assert sorted(done) == sorted([*range(50)] * 2)
+    with pytest.raises(ZeroDivisionError), pool.crew(2):
+        pool.run([lambda: None, lambda: 1 / 0], 2)
+    pool.run([lambda: done.append(-1)] * 2, 2)
+    assert done[-2:] == [-1, -1]
 
 
 def test_map_gives_what_it_has_before_a_broken_source(random_pair):

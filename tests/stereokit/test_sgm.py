@@ -16,6 +16,12 @@ def cost_of(largest):
     return RowCost(lambda *_: None, largest)
 
 
+class Dear(RowCost):
+    """A cost that the second sweep takes back from the path costs of the first."""
+
+    dear = True
+
+
 def volume_of(shape, count, largest, seed=0):
     return np.random.default_rng(seed).integers(0, largest + 1, (*shape, count)).astype(np.uint8)
 
@@ -52,6 +58,20 @@ def test_penalties_of_every_size(p1, p2):
     volume = volume_of((5, 6), 12, 62, seed=2)
     expected = oracles.sgm(volume, p1, p2, oracles.DIRECTIONS[8])
     np.testing.assert_array_equal(sums(volume, 62, p1, p2), expected)
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (7, 40)])
+@pytest.mark.parametrize("count", [1, 5, 64, 65, 130])
+@pytest.mark.parametrize("largest", [31, 254])
+def test_costs_that_are_recovered_are_those_that_were_computed(shape, count, largest):
+    volume = volume_of(shape, count, largest, seed=3)
+    volume[::2] //= 3
+    guide, p1, p2 = guide_of(shape) // 8, (255 - largest) // 3, 255 - largest
+    expected = oracles.sgm(volume, p1, p2, oracles.DIRECTIONS[4], guide, 8, 0.5)
+    for threads in (1, 2):
+        options = {"p1": p1, "p2": p2, "edge": 8, "edge_factor": 0.5, "threads": threads}
+        total = aggregate(volume, guide, "sgm", cost=Dear(lambda *_: None, largest), **options)
+        np.testing.assert_array_equal(total, expected)
 
 
 @pytest.mark.parametrize("largest", [1, 62, 127, 254])

@@ -1,0 +1,122 @@
+"""All of post-processing in place, for `stereokit.Matcher`: what the public functions do, in bands, without copies.
+
+Single matching phase, then speckles, then filling, then the median. What stays within a row or a band is done for a
+band by one thread while the band is in its cache; threads wait for each other only where regions cross from band to
+band and before the median, which looks over a band's edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.kernels.pool import run_stages, spans
+from stereokit.kernels.workspace import Workspace
+from stereokit.postprocess.fill import fill_empty_rows, fill_rows
+from stereokit.postprocess.median import median_rows
+from stereokit.postprocess.smp import resolve_rows
+from stereokit.postprocess.speckle import erase, find_regions, join_rows
+
+__all__ = ["Chain", "post_process"]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What is to be done: the options of `stereokit.Matcher`, checked there.
+
+    Attributes
+    ----------
+    smp : bool
+        Single matching phase.
+    speckle : int
+        Largest region that is removed, pixels.
+    fill : {"background", "nearest"} or None
+        Rule of filling.
+    median : {0, 3, 5}
+        Side of the window.
+    nothing : float
+        Disparity of a filled map in which no pixel was valid.
+    """
+
+    smp: bool
+    speckle: int
+    fill: str | None
+    median: int
+    nothing: float
+
+
+def post_process(
+    disparity: NDArray[np.float32], cost: NDArray[Any], bad: NDArray[np.bool_] | None, chain: Chain,
+    workspace: Workspace, threads: int,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:  # fmt: skip
+    """Return the finished map and which of its pixels were measured, both new.
+
+    Parameters
+    ----------
+    disparity : (H, W) float32, pixels, NaN where invalid
+        As selected; overwritten.
+    cost : (H, W)
+        Aggregated cost of each pixel's match.
+    bad : (H, W) bool or None
+        Pixels without evidence.
+    chain : Chain
+        What to do.
+    workspace : Workspace
+        Buffers.
+    threads : int
+        Threads to use; the result does not depend on it.
+    """
+    height, width = disparity.shape
+    parts = spans(height, threads)
+    flat = disparity.reshape(-1)
+    valid = np.empty(disparity.shape, np.bool_)
+    owners = workspace.array("smp.owners", (len(parts), width), np.int32)
+    size = flat.size if chain.speckle else 0
+    label, parent, count = (workspace.array(f"speckle.{name}", size, np.int32) for name in ("label", "parent", "count"))
+    limit = np.float32(1)
+    out = np.empty_like(disparity)
+    incomplete: list[int] = []  # bands with rows that have nothing to be filled from
+
+    def match(k: int, y0: int, y1: int) -> None:
+        if bad is not None:
+            disparity[y0:y1][bad[y0:y1]] = np.nan
+        if chain.smp:
+            resolve_rows(disparity, cost, y0, y1, owners[k])
+        if chain.speckle:
+            find_regions(flat, width, y0, y1, limit, label, parent, count)
+
+    def join() -> None:
+        for y0, _ in parts[1:]:
+            join_rows(flat, width, y0, limit, label, parent, count)
+
+    def clean(y0: int, y1: int) -> None:
+        if chain.speckle:
+            erase(flat, y0 * width, y1 * width, chain.speckle, label, parent, count)
+        np.equal(disparity[y0:y1], disparity[y0:y1], out=valid[y0:y1])  # NaN is not
+        if chain.fill is not None and fill_rows(disparity, y0, y1, chain.fill == "nearest"):
+            incomplete.append(y0)
+
+    def smooth_rows(y0: int, y1: int) -> None:
+        if incomplete:
+            return
+        if chain.median:
+            median_rows(disparity, chain.median, y0, y1, out, workspace, chain.fill is not None)
+        else:
+            out[y0:y1] = disparity[y0:y1]
+
+    stages: list[list[Any]] = [[partial(match, k, y0, y1) for k, (y0, y1) in enumerate(parts)]]
+    if chain.speckle and len(parts) > 1:
+        stages.append([join])
+    stages.append([partial(clean, y0, y1) for y0, y1 in parts])
+    stages.append([partial(smooth_rows, y0, y1) for y0, y1 in parts])
+    run_stages(stages, threads)
+    if incomplete:  # rare: rows without any valid pixel take those of others
+        incomplete.clear()
+        if not fill_empty_rows(disparity):
+            disparity[:] = chain.nothing
+        run_stages(stages[-1:], threads)
+    return out, valid

@@ -1,0 +1,232 @@
+"""``stereokit export``: what is written runs elsewhere and says what the refiner says; bad input writes nothing."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from refining import NAMES, coarse_of, flat_ranges, half_of, image_of, random_content, weight_file
+from typer.testing import CliRunner
+
+from stereokit import Disparity
+from stereokit.cli import app
+from stereokit.errors import FileError
+from stereokit_refiners import export as module
+from stereokit_refiners.network import LearnedRefiner
+from stereokit_refiners.weights import NETWORKS, shipped
+
+for _package in ("safetensors", "onnx", "onnxruntime"):
+    pytest.importorskip(_package)
+
+FORMS = [(name, "residual") for name in NAMES] + [("stereovae", "literal"), ("cnn", "literal")]
+SIZES = [(32, 48), (16, 16), (64, 32)]
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["export", *map(str, arguments)])
+
+
+def failed(result, *parts):
+    """Check that a command ended with 2 and one line, which holds `parts`."""
+    assert result.exit_code == 2, (result.exit_code, result.output, result.exception)
+    lines = [line for line in result.output.splitlines() if line.strip()]
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("error: ")
+    for part in parts:
+        assert part in lines[0], lines[0]
+
+
+def feeds(content, size):
+    coarse, left = coarse_of(size, 4), image_of(size, 4)
+    given = {"coarse": coarse.disparity, "left": left.astype(np.float32), "valid": coarse.valid.astype(np.float32)}
+    if "valid" not in NETWORKS[content.network].inputs:
+        del given["valid"]
+    refined = LearnedRefiner.of(content, precision="fp32")(coarse, left).disparity
+    return {name: array[None, None] for name, array in given.items()}, refined
+
+
+@pytest.mark.parametrize(("name", "form"), FORMS)
+def test_onnx_files_are_the_refiner_at_any_size(name, form, tmp_path):
+    import onnx
+    import onnxruntime
+
+    weights, out = weight_file(tmp_path, name, form=form), tmp_path / "model.onnx"
+    result = run("-o", out, "--refiner", weights)
+    assert result.exit_code == 0, result.output
+    onnx.checker.check_model(onnx.load(out), full_check=True)
+    session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
+    for size in SIZES:
+        given, refined = feeds(random_content(name, form=form), size)
+        (found,) = session.run(["disparity"], given)
+        assert found.shape == (1, 1, *size)
+        np.testing.assert_allclose(found[0, 0], refined, rtol=0, atol=module.TOLERANCE_PX)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["model.onnx", weights.rpartition("/")[2]])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_openvino_files_are_the_refiner_at_any_size(name, tmp_path):
+    ov = pytest.importorskip("openvino")
+    weights, out = weight_file(tmp_path, name), tmp_path / "model.xml"
+    result = run("-o", out, "--refiner", weights, "--format", "openvino")
+    assert result.exit_code == 0, result.output
+    kept = sorted(p.name for p in tmp_path.iterdir())
+    assert kept == sorted(["model.xml", "model.bin", weights.rpartition("/")[2]])
+    core = ov.Core()
+    compiled = core.compile_model(core.read_model(out), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    for size in SIZES[:2]:
+        given, refined = feeds(random_content(name), size)
+        found = compiled(given)["disparity"]
+        assert found.shape == (1, 1, *size)
+        np.testing.assert_allclose(found[0, 0], refined, rtol=0, atol=module.TOLERANCE_PX)
+
+
+def test_the_report(tmp_path):
+    weights, out, report = weight_file(tmp_path, "cnn"), tmp_path / "m.onnx", tmp_path / "r.json"
+    result = run("-o", out, "--refiner", weights, "--json", report)
+    assert result.exit_code == 0, result.output
+    assert str(out) in result.output.replace("\n", "")
+    document = json.loads(report.read_text())
+    assert set(document) == {"output", "format", "network", "form", "weights", "largest_difference_px"}
+    assert (document["network"], document["form"], document["format"]) == ("cnn", "residual", "onnx")
+    assert document["weights"] == random_content("cnn").fingerprint
+    assert 0 <= document["largest_difference_px"] <= module.TOLERANCE_PX
+    printed = run("-o", out, "--refiner", weights, "--json", "-")
+    assert json.loads(printed.output) == document
+
+
+def test_a_calibrated_file_is_exported_in_full_precision(tmp_path):
+    """What leaves is float32, compared with the refiner in fp32, even where int8 would be chosen."""
+    weights = weight_file(tmp_path, "cnn", ranges=flat_ranges("cnn", 4))
+    result = run("-o", tmp_path / "m.onnx", "--refiner", weights)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_refiners_are_exported_by_name(name, tmp_path):
+    try:
+        shipped(name)
+    except FileError as error:
+        failed(run("-o", tmp_path / "m.onnx", "--refiner", name), f"no weights for '{name}' come with this version")
+        assert not list(tmp_path.iterdir())
+        pytest.skip(str(error))
+    assert run("-o", tmp_path / "m.onnx", "--refiner", name).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "parts"),
+    [
+        (["-o", "m.txt"], ["output must end in .onnx", "m.txt"]),
+        (["-o", "m.onnx", "--format", "openvino"], ["output must end in .xml", "m.onnx"]),
+        (["-o", "m.xml"], ["output must end in .onnx"]),
+        (["-o", "m.trt", "--format", "tensorrt"], ["format must be one of onnx, openvino", "'tensorrt'"]),
+        (["-o", "nowhere/m.onnx"], ["output must name a file in an existing folder", "nowhere"]),
+        (["-o", "folder.onnx"], ["output must name a file in an existing folder"]),
+        (["-o", "m.onnx", "--refiner", "none.safetensors"], ["weights must name a file", "none.safetensors"]),
+        (["-o", "m.onnx", "--refiner", "text.safetensors"], ["weights must be a safetensors file"]),
+        (["-o", "m.onnx", "--refiner", "linear"], ["must be one of stereovae, cnn, stereokit", "'linear'"]),
+        (["-o", "m.onnx", "--refiner", "cnn-0.safetensors", "--json", "nowhere/r.json"], ["--json"]),
+        (["-o", "m.onnx", "--refiner", "cnn-0.safetensors", "--json", "folder.onnx"], ["--json"]),
+    ],
+    ids=lambda value: " ".join(value) if value and value[0] == "-o" else "",
+)
+def test_bad_input_ends_with_one_line_and_writes_nothing(given, parts, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    weight_file(tmp_path, "cnn")
+    (tmp_path / "folder.onnx").mkdir()
+    (tmp_path / "text.safetensors").write_text("no weights")
+    before = sorted(tmp_path.rglob("*"))
+    if "--refiner" not in given:
+        given = [*given, "--refiner", "cnn-0.safetensors"]
+    failed(run(*given), *parts)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_graph_that_is_not_the_refiner_is_not_written(tmp_path, monkeypatch):
+    wrong = random_content("cnn", seed=5, last=0.5)
+    real = module.onnx_model
+    monkeypatch.setattr(module, "onnx_model", lambda content: real(wrong))
+    out = tmp_path / "m.onnx"
+    failed(
+        run("-o", out, "--refiner", weight_file(tmp_path, "cnn")), "differs from the refiner by", "nothing was written"
+    )
+    assert not out.exists()
+
+
+def test_a_graph_that_computes_nan_is_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "largest_difference", lambda content, model: float("nan"))
+    out = tmp_path / "m.onnx"
+    failed(run("-o", out, "--refiner", weight_file(tmp_path, "cnn")), "nothing was written")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("format", ["onnx", "openvino"])
+def test_nothing_half_written_stays(format, tmp_path, monkeypatch):
+    if format == "openvino":
+        pytest.importorskip("openvino")
+    ending = {"onnx": ".onnx", "openvino": ".xml"}[format]
+    weights, out = weight_file(tmp_path, "cnn"), tmp_path / f"m{ending}"
+    out.write_text("what was there before")
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    real = module.os.replace
+
+    def full(source, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    failed(run("-o", out, "--refiner", weights, "--format", format), "cannot write", "No space left on device")
+    monkeypatch.setattr("os.replace", real)
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_an_interrupted_openvino_export_leaves_no_half(tmp_path, monkeypatch):
+    """Killed between its two files: the .xml, which is written last, is missing or the old one."""
+    pytest.importorskip("openvino")
+    weights, out = weight_file(tmp_path, "cnn"), tmp_path / "m.xml"
+    real, moved = module.os.replace, []
+
+    def replace(source, target):
+        if moved:
+            raise OSError(5, "Input/output error")
+        moved.append(str(target))
+        real(source, target)
+
+    monkeypatch.setattr("os.replace", replace)
+    failed(run("-o", out, "--refiner", weights, "--format", "openvino"), "cannot write")
+    assert moved == [str(tmp_path / "m.bin")]
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("missing", ["onnx", "onnxruntime", "openvino"])
+def test_packages_that_are_missing_are_named(missing, tmp_path, monkeypatch):
+    import importlib.util
+
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == missing else real(n, *a))
+    out = tmp_path / "m.xml"
+    failed(run("-o", out, "--refiner", weight_file(tmp_path, "cnn"), "--format", "openvino"), f"export needs {missing}")
+    assert not out.exists()
+
+
+def test_the_difference_is_that_of_the_maps():
+    content = random_content("cnn")
+    model = module.onnx_model(content)
+    assert module.largest_difference(content, model) < module.TOLERANCE_PX
+    assert module.largest_difference(random_content("cnn", seed=1), model) > module.TOLERANCE_PX
+
+
+def test_exported_graphs_take_maps_without_gaps_only_as_documented(tmp_path):
+    """The head of the pyramid sees the mask: another mask is another map."""
+    import onnxruntime
+
+    content = random_content("stereokit")
+    session = onnxruntime.InferenceSession(module.onnx_model(content), providers=["CPUExecutionProvider"])
+    size = (32, 32)
+    coarse, left = coarse_of(size), image_of(size)
+    maps = []
+    for valid in (np.ones(half_of(size), bool), np.zeros(half_of(size), bool)):
+        given = {"coarse": coarse.disparity, "valid": valid.astype(np.float32), "left": left.astype(np.float32)}
+        maps.append(session.run(None, {k: v[None, None] for k, v in given.items()})[0][0, 0])
+        refined = LearnedRefiner.of(content, precision="fp32")(Disparity(coarse.disparity, valid), left)
+        np.testing.assert_allclose(maps[-1], refined.disparity, rtol=0, atol=module.TOLERANCE_PX)
+    assert np.abs(maps[0] - maps[1]).max() > 0.01

@@ -1,0 +1,75 @@
+"""The refiner of torch tensors is the refiner."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from refining import NAMES, coarse_of, image_of, one_line, random_content, weight_file
+
+from stereokit.errors import FileError, InputError, OptionError
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("safetensors")
+
+from stereokit_refiners.network import LearnedRefiner  # noqa: E402
+from stereokit_refiners.tensors import TensorRefiner  # noqa: E402
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+TOLERANCE_PX = 2e-3
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    return request.param
+
+
+@pytest.mark.parametrize("size", [(32, 48), (33, 47), (1, 1), (1, 9), (2, 3)])
+@pytest.mark.parametrize(
+    ("name", "form"), [(name, "residual") for name in NAMES] + [("stereovae", "literal"), ("cnn", "literal")]
+)
+def test_tensors_give_what_arrays_give(name, form, size, device):
+    content, coarse, left = random_content(name, form=form), coarse_of(size), image_of(size)
+    expected = LearnedRefiner.of(content, backend="torch")(coarse, left).disparity
+    refiner = TensorRefiner(content, device)
+    given = [torch.from_numpy(array).to(device) for array in (coarse.disparity, coarse.valid, left)]
+    kept = [tensor.clone() for tensor in given]
+    found = refiner(*given)
+    assert found.shape == size and found.dtype == torch.float32 and found.is_contiguous()
+    assert found.device.type == device
+    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=TOLERANCE_PX)
+    assert all(torch.equal(a, b) for a, b in zip(given, kept, strict=True))
+    again = refiner(coarse.disparity, coarse.valid, left)  # arrays of the host are taken too
+    assert torch.equal(again, found)
+
+
+def test_a_file_is_taken_by_its_path(tmp_path):
+    path = weight_file(tmp_path, "cnn")
+    given = coarse_of((16, 16)).disparity, coarse_of((16, 16)).valid, image_of((16, 16))
+    assert torch.equal(TensorRefiner(path, "cpu")(*given), TensorRefiner(random_content("cnn"), "cpu")(*given))
+    with pytest.raises(FileError, match="weights must name a file"):
+        TensorRefiner(str(tmp_path / "none.safetensors"), "cpu")
+    with pytest.raises(FileError):
+        TensorRefiner("resnet", "cpu")
+
+
+def test_devices_that_torch_lacks_are_refused():
+    for name in ("warp", "cuda:99"):
+        with pytest.raises(OptionError, match=rf"^device must be one that torch has, got '{name}'") as caught:
+            TensorRefiner(random_content("cnn"), name)
+        one_line(caught.value)
+
+
+def test_sizes_that_do_not_fit_are_refused():
+    refiner = TensorRefiner(random_content("cnn"), "cpu")
+    coarse, valid, left = torch.zeros(8, 8), torch.ones(8, 8, dtype=torch.bool), torch.zeros(16, 16, dtype=torch.uint8)
+    for given in (
+        (coarse[:7], valid, left),
+        (coarse, valid, left[None]),
+        (coarse, valid[:7], left),
+        (left, valid, left),
+    ):
+        with pytest.raises(InputError) as caught:
+            refiner(*given)
+        one_line(caught.value)

@@ -33,4 +33,4 @@ types: $(VENV)/.dev  ## the strict type checker
 check: lint types test  ## what CI runs
 
 clean:  ## remove what the tasks made
-	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache build dist demo
+	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache build dist demo study

@@ -12,7 +12,8 @@ threads, and takes so long that it is called at most three times.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -23,9 +24,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.defaults import METHODS
+from stereokit.io import from_opencv
 from stereokit.matching import Matcher
+from stereokit.result import Disparity
 
-__all__ = ["HH", "PEERS", "THREE_WAY", "Call", "Peer", "label", "make", "peers", "usable_levels"]
+__all__ = [
+    "HH",
+    "PEERS",
+    "THREE_WAY",
+    "Call",
+    "Peer",
+    "label",
+    "make",
+    "opencv_threads",
+    "padded",
+    "peers",
+    "usable_levels",
+]
 
 Call = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[Any]]
 """Left and right image, both (H, W) uint8, to a disparity map."""
@@ -164,3 +179,38 @@ def make(key: str, levels: int, threads: int) -> Call:
         return PEERS[key].make(levels)
     matcher = Matcher(key, max_disparity=levels, threads=threads)
     return lambda left, right: matcher(left, right).disparity
+
+
+@contextmanager
+def opencv_threads(threads: int) -> Iterator[None]:
+    """Let OpenCV use so many threads inside the context."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def padded(key: str, levels: int) -> Callable[[NDArray[Any], NDArray[Any]], Disparity]:
+    """Return an OpenCV peer as a matcher that gives the leftmost columns a disparity too.
+
+    Both images are extended on the left by as many columns as there are levels, with copies of the border pixel,
+    and the map is cropped; without that OpenCV leaves these columns without a value.
+
+    Parameters
+    ----------
+    key : str
+        A name in `PEERS` that starts with OpenCV.
+    levels : int
+        Disparities 0 to `levels` - 1, rounded up to a multiple of 16.
+    """
+    compute, columns = PEERS[key].make(levels), usable_levels(levels)
+
+    def match(left: NDArray[Any], right: NDArray[Any]) -> Disparity:
+        wide: list[Any] = [cv2.copyMakeBorder(image, 0, 0, columns, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
+        disparity = from_opencv(compute(wide[0], wide[1])[:, columns:])
+        disparity[disparity < 0] = np.nan
+        return Disparity(np.ascontiguousarray(disparity), np.isfinite(disparity))
+
+    return match

@@ -23,7 +23,18 @@ from stereokit.kernels.simd import vector_bits
 from stereokit_evaluation._peers import HH, PEERS, THREE_WAY, label, usable_levels
 from stereokit_evaluation._rounds import Spread, ratio, spread
 
-__all__ = ["SIZES", "Findings", "Size", "as_json", "print_tables"]
+__all__ = [
+    "SIZES",
+    "Findings",
+    "Size",
+    "as_json",
+    "format_ms",
+    "load",
+    "machine",
+    "new_table",
+    "print_tables",
+    "versions",
+]
 
 
 @dataclass(frozen=True)
@@ -85,7 +96,7 @@ class Findings:
     allocated: dict[tuple[str, str], int] = field(default_factory=dict)
     skipped: list[dict[str, Any]] = field(default_factory=list)
     interrupted: bool = False
-    load: list[float] | None = field(default_factory=lambda: _load())
+    load: list[float] | None = field(default_factory=lambda: load())
 
     def skip(self, size: Size, contender: str, threads: int, reason: str) -> None:
         """Note that a contender was left out."""
@@ -154,14 +165,19 @@ def as_json(findings: Findings, options: dict[str, Any]) -> dict[str, Any]:
         },
         "options": options,
         "interrupted": findings.interrupted,
-        "versions": _versions(),
-        "machine": {
-            "cpu": _cpu_name(),
-            "processors": available_threads(),
-            "vector_bits": vector_bits(),
-            "system": f"{platform.system()} {platform.machine()}",
-            "load": findings.load,
-        },
+        "versions": versions(),
+        "machine": machine(findings.load),
+    }
+
+
+def machine(at_start: list[float] | None) -> dict[str, Any]:
+    """Return what times depend on: processor, number of processors, vector width, system, and the given load."""
+    return {
+        "cpu": _cpu_name(),
+        "processors": available_threads(),
+        "vector_bits": vector_bits(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "load": at_start,
     }
 
 
@@ -179,7 +195,7 @@ def print_tables(findings: Findings) -> None:
             console.print(_stages_table(size, stages, allocated))
     if findings.first:
         count = max(findings.threads)
-        table = _table(f"first call in a new process, warm disk cache, {findings.first_size}, {_threads(count)}")
+        table = new_table(f"first call in a new process, warm disk cache, {findings.first_size}, {_threads(count)}")
         for head in ("import s", "first call s"):
             table.add_column(head, justify="right")
         for key, seconds in findings.first.items():
@@ -188,15 +204,17 @@ def print_tables(findings: Findings) -> None:
     for skip in findings.skipped:
         line = f"left out: {skip['contender']}, {skip['size']}, {_threads(skip['threads'])}: {skip['reason']}"
         console.print(line, markup=False, highlight=False)
-    versions = ", ".join(f"{name} {number}" for name, number in _versions().items() if number)
-    load = "" if findings.load is None else f", load {findings.load[0]:.1f} at the start"
-    machine = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{load}"
-    console.print(machine, markup=False, highlight=False)
-    console.print(versions, highlight=False)
+    numbers = ", ".join(f"{name} {number}" for name, number in versions().items() if number)
+    busy = "" if findings.load is None else f", load {findings.load[0]:.1f} at the start"
+    place = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{busy}"
+    console.print(place, markup=False, highlight=False)
+    console.print(numbers, highlight=False)
 
 
 def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> Table:
-    table = _table(f"{size.name}: {size.width}x{size.height}, {size.levels} levels, median of {findings.rounds} rounds")
+    table = new_table(
+        f"{size.name}: {size.width}x{size.height}, {size.levels} levels, median of {findings.rounds} rounds"
+    )
     weighed = any(name == size.name for name, _ in findings.memory)
     heads = ["threads", "ms", "q25-q75", "min", "x HH", "x 3WAY", "MDE/s", *(("MB", "of HH's") if weighed else ())]
     for head in heads:
@@ -212,9 +230,9 @@ def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> 
         table.add_row(
             row["contender"] + runs,
             str(row["threads"]),
-            _milliseconds(row["median_ms"]),
-            f"{_milliseconds(row['q25_ms'])}-{_milliseconds(row['q75_ms'])}",
-            _milliseconds(row["min_ms"]),
+            format_ms(row["median_ms"]),
+            f"{format_ms(row['q25_ms'])}-{format_ms(row['q75_ms'])}",
+            format_ms(row["min_ms"]),
             _times_faster(row["x_hh"], row["kind"]),
             _times_faster(row["x_3way"], row["kind"]),
             _figure(row["mde_per_s"], 0),
@@ -225,7 +243,7 @@ def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> 
 
 
 def _stages_table(size: Size, stages: dict[str, dict[str, float]], allocated: dict[str, int]) -> Table:
-    table = _table(f"{size.name}: stages, 1 thread, ms", "stage")
+    table = new_table(f"{size.name}: stages, 1 thread, ms", "stage")
     for key in stages:
         table.add_column(label(key), justify="right")
     names: list[str] = []  # of all methods, each stage after the one that it follows in its method
@@ -241,7 +259,8 @@ def _stages_table(size: Size, stages: dict[str, dict[str, float]], allocated: di
     return table
 
 
-def _table(title: str, first: str = "contender") -> Table:
+def new_table(title: str, first: str = "contender") -> Table:
+    """Return an empty table in the style of this command, with its first column."""
     table = Table(title=title, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column(first, no_wrap=True)
     return table
@@ -251,7 +270,8 @@ def _threads(count: int) -> str:
     return f"{count} thread" if count == 1 else f"{count} threads"
 
 
-def _milliseconds(value: float) -> str:
+def format_ms(value: float) -> str:
+    """Return milliseconds with about three digits."""
     return f"{value:.2f}" if value < 10 else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
 
 
@@ -270,7 +290,8 @@ def _share(findings: Findings, size: str, key: str) -> float | None:
     return ours / theirs if ours is not None and theirs else None
 
 
-def _versions() -> dict[str, str | None]:
+def versions() -> dict[str, str | None]:
+    """Return the versions of this package and of those that times depend on."""
     found: dict[str, str | None] = {name: _version(name) for name in ("stereokit", "numba", "numpy")}
     found |= {"opencv": cv2.__version__, "python": platform.python_version()}
     others = {peer.module for peer in PEERS.values()} - {"cv2"}
@@ -284,7 +305,8 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _load() -> list[float] | None:
+def load() -> list[float] | None:
+    """Return the system's load over 1, 5 and 15 minutes, None where it does not tell."""
     try:
         return list(os.getloadavg())
     except (AttributeError, OSError):  # not on Windows

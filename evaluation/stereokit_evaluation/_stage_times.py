@@ -5,7 +5,8 @@ While it runs, the functions that `stereokit.matching` calls (input checks, smoo
 are found by what they are, not by name: a function that the core renames shows under its new name, and what is not
 found stays in "other". Times are exclusive: a stage does not count the stages inside it.
 
-The calls run on one thread. Nothing else in the process may match at the same time.
+With the kernels that the sweep calls, the calls must run on one thread; `watched` by groups leaves those out, and
+is right for any number of threads. Nothing else in the process may match at the same time.
 """
 
 from __future__ import annotations
@@ -24,14 +25,17 @@ from numpy.typing import NDArray
 
 from stereokit import matching
 
-__all__ = ["OTHER", "TOTAL", "allocated_bytes", "stage_times"]
+__all__ = ["GROUPS", "OTHER", "TOTAL", "Watch", "allocated_bytes", "stage_times", "watched"]
 
 OTHER, TOTAL = "other", "total"
+GROUPS = ("prepare", "match", "clean", "refine")
+"""Groups of stages in their order: checks, resizing and what a cost prepares; the sweep, which makes costs, adds them
+up and selects in one pass; the post-processing; and the refiner."""
 
-_STAGES = ("stereokit.inputs", "stereokit.postprocess", "stereokit.selection")
+_STAGES = {"stereokit.inputs": "prepare", "stereokit.postprocess": "clean", "stereokit.selection": "clean"}
 
 
-class _Watch:
+class Watch:
     """Seconds by stage of one call; stages nest."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -89,8 +93,8 @@ def stage_times(
     matcher(left, right)  # compiled before names are replaced: a kernel that is not must not see the stand-ins
     rows: list[dict[str, float]] = []
     for _ in range(rounds):
-        watch = _Watch(clock)
-        with _watched(matcher, watch):
+        watch = Watch(clock)
+        with watched(matcher, watch):
             begun = clock()
             matcher(left, right)
             total = clock() - begun
@@ -122,13 +126,25 @@ def allocated_bytes(method: str, levels: int, left: NDArray[np.uint8], right: ND
 
 
 @contextmanager
-def _watched(matcher: Any, watch: _Watch) -> Iterator[None]:
-    """Replace the stages of `matcher` by timed ones, and put them back."""
+def watched(matcher: Any, watch: Watch, *, groups: bool = False) -> Iterator[None]:
+    """Replace the stages of `matcher` by timed ones, and put them back.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        Its calls are watched inside the context; what they allocate and return is the same.
+    watch : Watch
+        Collects the seconds.
+    groups : bool
+        Add the stages up in `GROUPS`, and leave the kernels that other threads may run alone.
+    """
     replaced: list[tuple[Any, str, Any]] = []
     try:
-        for owner, attribute, name in _targets(matcher):
+        for owner, attribute, name, group in _targets(matcher):
+            if groups and group is None:
+                continue
             original = vars(owner)[attribute]
-            setattr(owner, attribute, watch.wrap(name, original))
+            setattr(owner, attribute, watch.wrap(group if groups and group else name, original))
             replaced.append((owner, attribute, original))
         yield
     finally:
@@ -136,23 +152,26 @@ def _watched(matcher: Any, watch: _Watch) -> Iterator[None]:
             setattr(owner, attribute, original)
 
 
-def _targets(matcher: Any) -> list[tuple[Any, str, str]]:
-    """Return where each stage's name is looked up: owner, attribute and the name to report."""
-    found: list[tuple[Any, str, str]] = []
+def _targets(matcher: Any) -> list[tuple[Any, str, str, str | None]]:
+    """Return where each stage's name is looked up: owner, attribute, the name to report and the stage's group."""
+    found: list[tuple[Any, str, str, str | None]] = []
     homes: dict[str, Any] = {}
     for attribute, value in vars(matching).items():
-        if isinstance(value, FunctionType) and value.__module__.startswith(_STAGES):
-            found.append((matching, attribute, _words(attribute)))
+        if isinstance(value, FunctionType) and value.__module__.startswith(tuple(_STAGES)):
+            group = next(group for module, group in _STAGES.items() if value.__module__.startswith(module))
+            found.append((matching, attribute, _words(attribute), group))
             homes[value.__module__] = sys.modules[value.__module__]
-    found += [(home, part, _words(part)) for home in homes.values() for part in _kernels(home)]
-    for stage, attribute, name in (
-        (getattr(matcher, "cost", None), "prepare", "prepare cost"),
-        (getattr(matcher, "aggregation", None), "sweep", "sweep, around its kernels"),
+    found += [(home, part, _words(part), None) for home in homes.values() for part in _kernels(home)]
+    for stage, attribute, name, group in (
+        (getattr(matcher, "cost", None), "prepare", "prepare cost", "prepare"),
+        (getattr(matcher, "aggregation", None), "sweep", "sweep, around its kernels", "match"),
     ):
         if isinstance(vars(type(stage)).get(attribute), FunctionType):
-            found.append((type(stage), attribute, name))
+            found.append((type(stage), attribute, name, group))
+    if callable(vars(matcher).get("_refine")):
+        found.append((matcher, "_refine", "refine", "refine"))
     home = sys.modules[type(getattr(matcher, "aggregation", None)).__module__]
-    found += [(home, part, f"sweep: {_words(part)}") for part in _kernels(home)]
+    found += [(home, part, f"sweep: {_words(part)}", None) for part in _kernels(home)]
     return found
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.calibration import Calibration, read_calibration
 from stereokit.errors import FileError, OptionError, UnknownNameError, did_you_mean
 from stereokit.io import read_disparity, read_image
 from stereokit_evaluation.frames import Frame, Loader, select
@@ -142,6 +143,7 @@ def scenes(count: int = 20) -> list[Frame]:
             noc=part(index, lambda scene: scene.noc),
             occ=part(index, lambda scene: scene.occ),
             objects=part(index, lambda scene: scene.objects),
+            calibration=partial(_scene_calibration, index),
         )
         for index in range(count)
     ]
@@ -189,6 +191,12 @@ def _scene(index: int) -> Any:
     return import_module("stereokit_evaluation.scenes").generate(index, *_SCENE_SIZE)
 
 
+def _scene_calibration(index: int) -> Calibration:
+    scene = _scene(index)
+    focal = float(scene.focal_px)
+    return Calibration(focal, focal, float(scene.cx), float(scene.cy), float(scene.baseline_m))
+
+
 def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth: Sequence[str]) -> list[Frame]:
     given = _root(root)
     base = given / "training" if (given / "training").is_dir() else given
@@ -205,11 +213,19 @@ def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth
             occ=_lazy(read_disparity, _existing(occ / f"{name}.png")),
             objects=_lazy(read_image, _existing(objects / f"{name}.png")),
             max_disparity=_KITTI_DISPARITIES,
+            calibration=_kitti_calibration(base, name, (2, 3) if a != "image_0" else (0, 1)),
         )
         for name in names
     ]
     wanted = f"[training/]{a}/*_10.png, {b}/*_10.png, {truth[0]}/*_10.png, {truth[1]}/*_10.png"
     return _found(title, frames, given, wanted)
+
+
+def _kitti_calibration(base: Path, name: str, cameras: tuple[int, int]) -> Callable[[], Calibration] | None:
+    number = name.partition("_")[0]
+    places = (base / folder / f"{number}.txt" for folder in ("calib_cam_to_cam", "calib"))  # of 2015, of 2012
+    path = next((path for path in places if path.exists()), None)
+    return None if path is None else partial(read_calibration, path, cameras)
 
 
 def _with_calibration(base: Path) -> Iterator[Frame]:
@@ -227,6 +243,7 @@ def _with_calibration(base: Path) -> Iterator[Frame]:
             noc=None if occ is None or mask is None else partial(_masked, occ, mask),
             occ=occ,
             max_disparity=_ndisp(scene / "calib.txt"),
+            calibration=partial(read_calibration, path) if (path := scene / "calib.txt").exists() else None,
         )
 
 

@@ -24,9 +24,10 @@ from rich.console import Console
 from rich.table import Table
 
 from stereokit.commandline import JsonOption, check_json, write_json
-from stereokit.errors import FileError, InputError, OptionError, StereokitError
+from stereokit.errors import InputError, OptionError, StereokitError
 from stereokit.io import write_image
 from stereokit.result import colorize
+from stereokit_evaluation._folders import check_folder, make_folder
 from stereokit_evaluation.errormap import error_map
 from stereokit_evaluation.figures import d1
 from stereokit_evaluation.metrics import Score, score
@@ -180,7 +181,7 @@ def demo(
             times.append(time.perf_counter() - start)
         scored = score(found.disparity, noc=scene.noc, occ=scene.occ, objects=scene.objects, measured=found.valid)
         outcomes.append(_Outcome(matcher, label, found.disparity, scored, statistics.median(times)))
-    _make_folder(output)
+    make_folder(output)
     _write_pictures(output, scene, outcomes)
     document = {"results": [_as_json(outcome) for outcome in outcomes]}
     if write_json(json_file, document):
@@ -199,16 +200,7 @@ def _parse_size(size: str) -> tuple[int, int]:
 def _check_places(output: Path, json_file: Path | None) -> None:
     """Refuse what cannot be written before any work is done."""
     check_json(json_file)
-    nearest = next(place for place in (output, *output.absolute().parents) if place.exists())
-    if not nearest.is_dir():
-        raise FileError(f"output must be a folder, got {str(output)!r} ({str(nearest)!r} is a file)")
-
-
-def _make_folder(output: Path) -> None:
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"output must be a folder, got {str(output)!r} ({error.strerror})") from error
+    check_folder(output)
 
 
 def _write_pictures(folder: Path, scene: Scene, outcomes: Sequence[_Outcome]) -> None:

@@ -20,8 +20,9 @@ from rich.table import Table
 
 from stereokit import __version__
 from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
-from stereokit.errors import FileError, OptionError
+from stereokit.errors import OptionError
 from stereokit.io import write_image
+from stereokit_evaluation._folders import make_folder
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation.datasets import load, select
 from stereokit_evaluation.errormap import error_map
@@ -151,10 +152,7 @@ def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -
 
 
 def _draws(folder: Path) -> Callable[..., None]:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"error_maps must be a folder, got {str(folder)!r} ({error})") from error
+    make_folder(folder, "error_maps")
 
     def draw(frame: Frame, found: Estimate, noc: NDArray[Any] | None, occ: NDArray[Any] | None) -> None:
         everything = noc if occ is None else occ

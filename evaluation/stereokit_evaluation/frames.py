@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.calibration import Calibration
 from stereokit.errors import OptionError
 from stereokit.io import read_image
 
@@ -36,6 +37,8 @@ class Frame:
         object map; None where there is none.
     max_disparity : int, optional
         Disparities to search for this pair, None if the data set does not say.
+    calibration : callable, optional
+        Function that returns the cameras' geometry; None where it is not known.
     """
 
     name: str
@@ -45,6 +48,7 @@ class Frame:
     occ: Loader | None = None
     objects: Loader | None = None
     max_disparity: int | None = None
+    calibration: Callable[[], Calibration] | None = None
 
     def load_left(self, *, gray: bool = False) -> NDArray[Any]:
         """Return the left image, (H, W) or (H, W, 3) RGB, in the type that it was stored in."""
@@ -65,6 +69,10 @@ class Frame:
     def load_objects(self) -> NDArray[Any] | None:
         """Return the object map, (H, W) integers, 0 background, or None."""
         return None if self.objects is None else self.objects()
+
+    def load_calibration(self) -> Calibration | None:
+        """Return the geometry that turns disparity into depth, or None."""
+        return None if self.calibration is None else self.calibration()
 
 
 def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:

@@ -11,8 +11,7 @@ OpenCV's SGBM and HH modes hardly use a second thread; they are reported for eve
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Annotated
@@ -27,12 +26,16 @@ from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
 from stereokit.io import read_image
 from stereokit.methods import parse_method
-from stereokit_evaluation._peers import PEERS, Call, label, make, peers
+from stereokit_evaluation._peers import PEERS, Call, label, make, opencv_threads, peers
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation._rounds import round_robin
-from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
+from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, load, machine, print_tables, versions
 from stereokit_evaluation._stage_times import allocated_bytes, stage_times
+from stereokit_evaluation.grid import settings_at_hand
+from stereokit_evaluation.pipeline import PipelineRow, print_pipeline, time_pipeline
+from stereokit_evaluation.pipeline import as_json as pipeline_json
+from stereokit_evaluation.published import PAPER
 from stereokit_evaluation.scenes import generate
 
 __all__ = ["bench", "parse_sizes", "parse_threads"]
@@ -55,6 +58,9 @@ def bench(
         list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat; all four by default.")
     ] = None,
     rounds: Annotated[int, typer.Option(help="Times that everyone is called.")] = 9,
+    pipeline: Annotated[
+        bool, typer.Option("--pipeline", help="The paper's table II instead: S4 with each refiner, end to end.")
+    ] = False,
     stages: Annotated[bool, typer.Option("--stages", help="Time the stages of our methods too.")] = False,
     left: Annotated[Path | None, typer.Option(help="Left image, instead of a synthetic one.")] = None,
     right: Annotated[Path | None, typer.Option(help="Right image.")] = None,
@@ -82,6 +88,10 @@ def bench(
     pictures = None if left is None or right is None else (_read(left), _read(right))
     if pictures is not None and pictures[0].shape != pictures[1].shape:
         raise InputError(f"left and right must have the same size, got {pictures[0].shape} and {pictures[1].shape}")
+    if pipeline and stages:
+        raise OptionError("pipeline and stages are two tables, got both; choose one")
+    if pipeline:
+        return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, json_file)
     methods = list(dict.fromkeys(parse_method(name) for name in method or METHODS))
     contenders = [*methods, *(peers() if with_peers else ())]
 
@@ -99,7 +109,7 @@ def bench(
                 if size in weighed:
                     _weigh(size, max(counts), contenders, images, findings, step)
                 for name in methods if stages else ():
-                    with _opencv_threads(1):
+                    with opencv_threads(1):
                         findings.stages[size.name, name] = stage_times(name, size.levels, *images, rounds)
                         findings.allocated[size.name, name] = allocated_bytes(name, size.levels, *images, 1)
                     step(f"{size.name}: stages of {name}")
@@ -117,6 +127,39 @@ def bench(
     if not write_json(json_file, as_json(findings, options)):
         print_tables(findings)
     if findings.interrupted:
+        raise typer.Exit(130)
+
+
+def _pipeline(
+    sizes: Sequence[Size],
+    counts: Sequence[int],
+    methods: Sequence[str],
+    rounds: int,
+    pictures: tuple[Gray, Gray] | None,
+    with_peers: bool,
+    json_file: Path | None,
+) -> None:
+    """Time table II of the paper, print it and write it."""
+    rows: list[PipelineRow] = []
+    interrupted = False
+    each = len(methods) * len(settings_at_hand()) + 2 * with_peers
+    about = machine(load())
+    with progress(len(sizes) * len(counts) * each * (1 + rounds)) as (console, step):
+        try:
+            for size in sizes:
+                images = _images(size, pictures)
+                for count in counts:
+                    time_pipeline(size, count, methods, images, rounds, rows, with_peers=with_peers, step=step)
+        except KeyboardInterrupt:
+            interrupted = True
+            console.print("interrupted: the figures are those measured so far", highlight=False)
+    document = {
+        "pipeline": pipeline_json(rows), "interrupted": interrupted, "source_of_published": PAPER,
+        "machine": about, "versions": versions(),
+    }  # fmt: skip
+    if not write_json(json_file, document):
+        print_pipeline(sizes, rows)
+    if interrupted:
         raise typer.Exit(130)
 
 
@@ -184,7 +227,7 @@ def _time(
 ) -> None:
     """Warm everyone up, then time them in turns; the seconds go to ``findings.times``."""
     calls: dict[str, Call] = {}
-    with _opencv_threads(threads):
+    with opencv_threads(threads):
         for key in contenders:
             step(f"{size.name}, {threads} threads: {label(key)}, first call")
             reason = _too_large(key, size)
@@ -255,13 +298,3 @@ def _free_bytes() -> float | None:
     except OSError:
         pass
     return None
-
-
-@contextmanager
-def _opencv_threads(threads: int) -> Iterator[None]:
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(threads)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

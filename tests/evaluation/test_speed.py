@@ -17,7 +17,7 @@ from stereokit_evaluation import _peers, _progress, _speed_report, speed
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._rounds import ratio, round_robin, spread
 from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
-from stereokit_evaluation._stage_times import OTHER, TOTAL, _Watch, stage_times
+from stereokit_evaluation._stage_times import OTHER, TOTAL, Watch, stage_times
 
 TINY = "64x48x16"
 
@@ -215,7 +215,7 @@ def test_a_peer_that_the_machine_cannot_hold_is_left_out(monkeypatch):
 
 def test_nested_stages_do_not_count_twice():
     ticks = iter([0.0, 1.0, 4.0, 10.0])  # outer begins, inner begins, inner ends, outer ends
-    watch = _Watch(lambda: next(ticks))
+    watch = Watch(lambda: next(ticks))
     inner = watch.wrap("inner", lambda: "result")
     outer = watch.wrap("outer", lambda: inner())
     assert outer() == "result"

@@ -1,0 +1,299 @@
+"""The pages in headless Chromium: they open, draw, sort, slide and tell numbers, without a word on the console.
+
+Screenshots are written to the folder that STEREOKIT_SCREENSHOTS names, when it is set.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stereokit.calibration import Calibration
+from stereokit_evaluation import viewer
+from stereokit_evaluation.report import render
+
+pytestmark = pytest.mark.browser
+ARGUMENTS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync"
+).split()
+NONE = "\u2013"
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """Return a running headless browser, or skip."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    path = next((found for name in names if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.skip("no Chromium on the PATH")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=path, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def study_file(tmp_path_factory):
+    """Return the page of a study of three small scenes."""
+    pytest.importorskip("plotly")
+    from typer import Typer
+    from typer.testing import CliRunner
+
+    from stereokit_evaluation import datasets
+    from stereokit_evaluation.study import study
+
+    out, app = tmp_path_factory.mktemp("study"), Typer()
+    app.command()(study)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(datasets, "_SCENE_SIZE", (320, 192))
+        datasets._scene.cache_clear()
+        words = ["--count", "3", "--max-disparity", "64", "--threads", "1", "--repeats", "1", "--no-peers"]
+        words += ["--setting", "linear", "--setting", "original", "-o", str(out)]
+        done = CliRunner().invoke(app, words)
+    datasets._scene.cache_clear()
+    assert done.exit_code == 0, (done.output, done.exception)
+    return out / "report.html"
+
+
+def small_pair():
+    """Return a pair whose numbers are known: disparity 10 everywhere, in gaps filled; truth 10, and 16 on the right."""
+    shape = (40, 120)
+    image = np.tile(np.arange(120, dtype=np.uint8), (40, 1))
+    valid = np.ones(shape, bool)
+    valid[:, :20] = False
+    truth = np.full(shape, 10, np.float32)
+    truth[:, 100:] = 16
+    seen = truth.copy()
+    seen[20:] = np.nan
+    ten, twelve = (np.full(shape, value, np.float32) for value in (10, 12.5))
+    maps = [viewer.Shown("ten", ten, valid), viewer.Shown("twelve", twelve, np.ones(shape, bool))]
+    camera = Calibration(fx=100, fy=100, cx0=60, cy=20, baseline_m=0.5)
+    return viewer.pair("known", image, maps, noc=seen, occ=truth, calibration=camera), maps
+
+
+@pytest.fixture(scope="module")
+def view_file(tmp_path_factory):
+    """Return the page of one pair."""
+    pytest.importorskip("jinja2")
+    pair, maps = small_pair()
+    path = tmp_path_factory.mktemp("view") / "view.html"
+    path.write_bytes(render("view.html.j2", [pair], title="known", version="0", maps=maps, methods=["ten", "twelve"]))
+    return path
+
+
+@contextmanager
+def opened(chromium, path, size="desktop", scheme="light"):
+    """Open a page in a fresh profile without a network; it must say nothing on the console and ask for nothing."""
+    width, height = SIZES[size]
+    context = chromium.new_context(viewport={"width": width, "height": height}, color_scheme=scheme, offline=True)
+    page, said, asked = context.new_page(), [], []
+    page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url[:60]))
+    page.goto(path.as_uri())
+    page.wait_for_selector("#viewer[data-ready]", timeout=20_000)
+    if page.query_selector("#charts"):
+        page.wait_for_selector("body[data-charts]", timeout=20_000)
+    yield page
+    if folder := os.environ.get("STEREOKIT_SCREENSHOTS"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=f"{folder}/{path.stem}-{size}-{scheme}.png", full_page=True)
+    context.close()
+    assert said == []
+    assert all(url.startswith(("file:", "data:", "blob:")) for url in asked)
+
+
+def pixels(page, canvas):
+    """Return the canvas's pixels as (H, W, 3) uint8, RGB."""
+    uri = page.evaluate(
+        """id => { const from = document.getElementById(id);
+                  const to = document.createElement('canvas');
+                  [to.width, to.height] = [from.width, from.height];
+                  to.getContext('2d', { willReadFrequently: true }).drawImage(from, 0, 0);
+                  return to.toDataURL('image/png'); }""",
+        canvas,
+    )
+    data = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def read(page):
+    """Return the rows under the cursor."""
+    cells = "r => [...r.children].map(c => c.textContent)"
+    return page.evaluate(f"[...document.querySelectorAll('#values tr')].map({cells})")
+
+
+def slide(page, value):
+    page.evaluate("v => { slider.value = v; slider.dispatchEvent(new Event('input')); }", value)
+
+
+def test_the_report_opens_with_its_charts(chromium, study_file):
+    with opened(chromium, study_file) as page:
+        assert page.locator(".js-plotly-plot").count() == 3
+        assert page.locator("#chart-e4 .bars path").count() >= 20
+        assert page.locator("#chart-time .points path").count() >= 12
+        names = page.locator("#chart-e4 .legendtext").all_text_contents()
+        assert "Mini+Linear, published" in names and "Mini+Linear, scenes" in names
+        before = page.evaluate("document.getElementById('chart-e4').data[1].y")
+        page.select_option("#region", "occ fg")
+        assert page.evaluate("document.getElementById('chart-e4').data[1].y") != before
+        assert page.evaluate("document.getElementById('chart-e4').data[0].y") == [17.6, 9.73, 10.95, 9.56]
+
+
+def test_tables_sort_both_ways_by_mouse_and_keyboard(chromium, study_file):
+    with opened(chromium, study_file) as page:
+        head = page.locator("#table-accuracy thead th").nth(2)
+
+        def column():
+            cells = page.locator("#table-accuracy tbody tr td:nth-child(3)").all_text_contents()
+            return [float(text) for text in cells]
+
+        head.locator("button").click()
+        assert column() == sorted(column()) and head.get_attribute("aria-sort") == "ascending"
+        head.locator("button").press("Enter")
+        assert column() == sorted(column(), reverse=True) and head.get_attribute("aria-sort") == "descending"
+        last = page.locator("#table-time thead th").last
+        last.locator("button").click()
+        texts = page.locator("#table-time tbody tr td:last-child").all_text_contents()
+        assert texts[0] == "12.64" and texts[1] == NONE  # what has no figure stays last
+
+
+def test_the_slider_moves_between_methods(chromium, study_file):
+    with opened(chromium, study_file) as page:
+        pictures = []
+        for value in (0, 50, 100):
+            slide(page, value)
+            pictures.append(pixels(page, "view-disparity"))
+        b, both, a = pictures
+        assert (a != b).any()
+        half = a.shape[1] // 2
+        assert (both[:60, : half - 8] == a[:60, : half - 8]).all()
+        assert (both[:60, half + 8 :] == b[:60, half + 8 :]).all()
+        page.locator("#slider").focus()
+        page.keyboard.press("ArrowLeft")
+        assert page.locator("#slider").input_value() == "99"
+        page.locator("#flip").click()
+        assert page.locator("#slider").input_value() == "0"
+
+
+def test_frames_and_methods_change_the_picture(chromium, study_file):
+    with opened(chromium, study_file) as page:
+        first = pixels(page, "view-left")
+        page.locator("#next").click()
+        page.wait_for_selector("#viewer[data-ready='2']")
+        assert (pixels(page, "view-left") != first).any() and page.locator("#previous").is_enabled()
+        slide(page, 100)
+        before = pixels(page, "view-error")
+        page.select_option("#method-a", index=0)
+        page.wait_for_selector("#viewer[data-ready='3']")
+        assert (pixels(page, "view-error") != before).any()
+
+
+def test_hovering_tells_disparity_error_and_depth(chromium, view_file):
+    with opened(chromium, view_file) as page:
+        box = page.locator("#view-disparity").bounding_box()
+
+        def point(x, y):
+            page.mouse.move(box["x"] + (x + 0.5) / 120 * box["width"], box["y"] + (y + 0.5) / 40 * box["height"])
+            assert page.locator("#position").text_content() == f"x {x}, y {y}"
+            return {row[0]: row[1:] for row in read(page)}
+
+        rows = point(50, 5)
+        assert rows["ten"] == ["10.00 px", "5.00 m", "0.00 px", ""]
+        assert rows["twelve"] == ["12.50 px", "4.00 m", "2.50 px", ""]
+        assert rows["true"] == ["10.00 px", "5.00 m", "", ""]
+        rows = point(110, 30)
+        assert rows["ten"] == ["10.00 px", "5.00 m", "6.00 px ✗", ""]
+        assert rows["true"][3] == "occluded"
+        assert point(5, 5)["ten"][3] == "filled"
+
+
+def test_the_keyboard_moves_the_cursor_and_turns_the_cloud(chromium, view_file):
+    with opened(chromium, view_file) as page:
+        page.locator("#view-left").focus()
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("Shift+ArrowUp")
+        assert page.locator("#position").text_content() == "x 61, y 10"
+        page.select_option("#zoom", "4")
+        page.keyboard.press("ArrowLeft")
+        cloud = page.locator("#view-cloud")
+        assert int(cloud.get_attribute("data-points")) == 40 * 120
+        before = pixels(page, "view-cloud")
+        cloud.focus()
+        page.keyboard.press("ArrowRight")
+        assert (pixels(page, "view-cloud") != before).any()
+        assert "metres" in page.locator("#cloud-unit").text_content()
+        page.locator("#cloud-toggle").click()
+        assert cloud.is_hidden()
+
+
+def test_errors_have_the_colours_of_the_benchmark(chromium, view_file):
+    from stereokit_evaluation.errormap import error_map
+
+    with opened(chromium, view_file) as page:
+        slide(page, 100)
+        pair, maps = small_pair()
+        truth = np.full((40, 120), 10, np.float32)
+        truth[:, 100:] = 16
+        seen = truth.copy()
+        seen[20:] = np.nan
+        wanted = error_map(maps[0].disparity, truth, seen, dilate=False)
+        drawn = pixels(page, "view-error")
+        away = np.ones((40, 120), bool)
+        away[6:34, 45:75] = False  # the cross of the cursor
+        assert (drawn == wanted)[away].all()
+        assert pair["top"] == 16
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", list(SIZES))
+def test_every_size_and_theme(chromium, study_file, size, scheme):
+    with opened(chromium, study_file, size, scheme) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
+        paper = "getComputedStyle(document.body).backgroundColor"
+        before = page.evaluate(paper)
+        assert (before == "rgb(255, 255, 255)") == (scheme == "light")
+        page.locator("#theme").click()
+        assert page.evaluate(paper) != before
+        page.locator("#theme").click()
+        assert page.evaluate(paper) == before
+
+
+def test_everything_has_a_name(chromium, study_file):
+    """Every control has a label, every table a caption, every picture a description, and headings do not jump."""
+    with opened(chromium, study_file) as page:
+        lacking = page.evaluate(
+            """() => [...document.querySelectorAll('button, select, input, canvas, table, [role=img]')].filter(e =>
+                !(e.getAttribute('aria-label') || e.labels?.length || e.querySelector('caption') ||
+                  e.textContent.trim() && e.tagName === 'BUTTON' || e.closest('.readout'))).map(e => e.outerHTML)"""
+        )
+        assert lacking == []
+        levels = page.evaluate("[...document.querySelectorAll('h1, h2, h3')].map(e => Number(e.tagName[1]))")
+        assert levels[0] == 1 and all(b - a <= 1 for a, b in itertools.pairwise(levels))
+        assert page.evaluate("document.documentElement.lang") == "en"
+        page.keyboard.press("Tab")
+        assert page.evaluate("document.activeElement.className") == "skip"
+
+
+def test_a_pair_without_truth_and_calibration(chromium, tmp_path):
+    shown = viewer.Shown("only", np.full((40, 120), 8, np.float32), np.ones((40, 120), bool))
+    pair = viewer.pair("bare", np.zeros((40, 120), np.uint8), [shown])
+    path = tmp_path / "bare.html"
+    path.write_bytes(render("view.html.j2", [pair], title="bare", version="0", maps=[shown], methods=["only", "only"]))
+    with opened(chromium, path, "phone") as page:
+        assert page.locator("#view-error").is_hidden() and page.locator("#slider").is_hidden()
+        assert read(page) == [["only", "8.00 px", NONE, ""]]
+        assert "in pixels" in page.locator("#cloud-unit").text_content()
+        assert json.loads(page.locator("#pair-0").text_content())["calibration"] is None

@@ -93,9 +93,10 @@ def train(
     for frame in (*more.values(), *(f for pair in groups for part in pair for f in part)):
         if frame.noc is None and frame.occ is None:
             raise InputError(f"frame {frame.name} has no ground truth to train on")
-    held = output / "cache" if cache is None else cache
-    make_folder("cache", held)
+    if cache is not None:
+        make_folder("cache", cache)
     make_folder("output", output)
+    held = output / "cache" if cache is None else cache
     world = _join_group(torch)
 
     def samples(which: Sequence[Frame], numbers: range, step: Callable[..., None]) -> list[Any]:
@@ -133,8 +134,9 @@ def train(
     for number, (training, held_out) in enumerate(groups):
         mine = [sample for frame in training for sample in maps[frame.name]]
         others = [sample for name in more for sample in maps[name]]
-        rest = 1 - (street_share if scenes else 0.0) - (extra_share if others else 0.0)
-        shares = ((mine, rest), (others, extra_share), (scenes, street_share))
+        of_streets = (street_share if mine or others else 1.0) if scenes else 0.0
+        of_others = (extra_share if mine else 1 - of_streets) if others else 0.0
+        shares = ((scenes, of_streets), (mine, 1 - of_streets - of_others), (others, of_others))
         sources = [Source(samples, share) for samples, share in shares if samples and share > 0]
         folder = output if folds is None else output / f"fold-{number}"
         where = [(frame.name, name) for frame in held_out for name in methods]

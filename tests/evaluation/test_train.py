@@ -293,7 +293,11 @@ def test_extra_frames_are_trained_on_in_every_fold_and_never_held_out(root, tmp_
         (file,) = (root / part).glob("000004.*")
         (other / part / file.name).write_bytes(file.read_bytes())
     trained(root, tmp_path / "out", "--folds", "0/1", "--extra", f"folder:{other}", "--json", report)
-    assert [(sorted(call.trained[0]), call.held_out) for call in recorded] == [([1, 4], [0]), ([0, 4], [1])]
+    assert [(call.trained[0], call.trained[1], call.held_out) for call in recorded] == [
+        ([1], [4], [0]),
+        ([0], [4], [1]),
+    ]
+    assert all(call.weights == [0.8, 0.2] for call in recorded)
     assert len(json.loads(report.read_text())["frames"]) == 3
 
 
@@ -421,7 +425,7 @@ BAD = [
     (["DATA", "--max-disparity", "0"], ["max_disparity"]),
     (["DATA", "--variants", "0"], ["variants at least 1"]),
     (["DATA", "--streets", "-1"], ["streets at least 0"]),
-    (["DATA", "--street-share", "1.5"], ["street_share must be from 0 to 1"]),
+    (["DATA", "--street-share", "1.5"], ["street_share and extra_share must be at least 0 and together at most 1"]),
     (["DATA", "--start", "none.safetensors"], ["weights must name a file"]),
     (["DATA", "--start", "text.safetensors"], ["weights must be a safetensors file"]),
     (["DATA", "--set", "stepz=3"], ["stepz", "steps"]),

@@ -44,7 +44,7 @@ and Motorcycle (``python -m stereokit_evaluation.search --data DIR --output sear
       p1          6: 5.18 (3.44); 9: 4.99 (3.23); 12: 4.92 (3.15); 15: 4.79 (3.14); 18: 4.77 (3.12); 21: 4.78 (3.13)
       p2          50: 4.98 (3.07); 68: 4.84 (3.12); 85: 4.79 (3.14); 100: 4.80 (3.19); 120: 4.82 (3.29)
 
-    S3 zncc+dt: tuning 5.65, validation 4.85, all 5.40; cones 3.45, teddy 5.08, Motorcycle 4.45
+    S3 zncc+dt: tuning 5.65, validation 4.86, all 5.40; cones 3.46, teddy 5.08, Motorcycle 4.38
       smooth      0: 6.11 (4.59); 0.5: 5.88 (4.23); 0.6: 5.77 (4.24); 0.7: 5.65 (4.33); 0.8: 5.62 (4.50);
                   1.0: 5.65 (4.70)
       outside     0.3: 5.71 (4.44); 0.5: 5.65 (4.33); 0.7: 5.65 (4.34); 1.0: 5.67 (4.36); None: 5.65 (4.35)

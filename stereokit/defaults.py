@@ -63,7 +63,7 @@ and Motorcycle (``python -m stereokit_evaluation.search --data DIR --output sear
       passes      2: 5.71 (4.38); 3: 5.75 (4.34)
       mode        sum: 6.65 (5.36)
 
-    S4 zncc+sgm: tuning 4.99, validation 4.50, all 4.84; cones 4.01, teddy 4.31, Motorcycle 4.44
+    S4 zncc+sgm: tuning 5.02, validation 4.49, all 4.85; cones 3.99, teddy 4.36, Motorcycle 4.45
       smooth      0: 4.99 (4.31); 0.5: 5.02 (4.24); 0.6: 4.99 (4.25); 0.7: 5.00 (4.44); 0.8: 5.10 (4.65);
                   1.0: 5.14 (5.00)
       outside     0.3: 5.02 (4.35); 0.5: 4.99 (4.25); 0.7: 5.00 (4.27); 1.0: 5.01 (4.29); None: 5.00 (4.27)

@@ -44,7 +44,7 @@ and Motorcycle (``python -m stereokit_evaluation.search --data DIR --output sear
       p1          6: 5.18 (3.44); 9: 4.99 (3.23); 12: 4.92 (3.15); 15: 4.79 (3.14); 18: 4.77 (3.12); 21: 4.78 (3.13)
       p2          50: 4.98 (3.07); 68: 4.84 (3.12); 85: 4.79 (3.14); 100: 4.80 (3.19); 120: 4.82 (3.29)
 
-    S3 zncc+dt: tuning 5.65, validation 4.85, all 5.40; cones 3.45, teddy 5.08, Motorcycle 4.45
+    S3 zncc+dt: tuning 5.65, validation 4.86, all 5.40; cones 3.46, teddy 5.08, Motorcycle 4.38
       smooth      0: 6.11 (4.59); 0.5: 5.88 (4.23); 0.6: 5.77 (4.24); 0.7: 5.65 (4.33); 0.8: 5.62 (4.50);
                   1.0: 5.65 (4.70)
       outside     0.3: 5.71 (4.44); 0.5: 5.65 (4.33); 0.7: 5.65 (4.34); 1.0: 5.67 (4.36); None: 5.65 (4.35)
@@ -63,7 +63,7 @@ and Motorcycle (``python -m stereokit_evaluation.search --data DIR --output sear
       passes      2: 5.71 (4.38); 3: 5.75 (4.34)
       mode        sum: 6.65 (5.36)
 
-    S4 zncc+sgm: tuning 4.99, validation 4.50, all 4.84; cones 4.01, teddy 4.31, Motorcycle 4.44
+    S4 zncc+sgm: tuning 5.02, validation 4.49, all 4.85; cones 3.99, teddy 4.36, Motorcycle 4.45
       smooth      0: 4.99 (4.31); 0.5: 5.02 (4.24); 0.6: 4.99 (4.25); 0.7: 5.00 (4.44); 0.8: 5.10 (4.65);
                   1.0: 5.14 (5.00)
       outside     0.3: 5.02 (4.35); 0.5: 4.99 (4.25); 0.7: 5.00 (4.27); 1.0: 5.01 (4.29); None: 5.00 (4.27)

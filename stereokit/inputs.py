@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError, OptionError, did_you_mean
-from stereokit.kernels.gauss import blur_rows, taps
-from stereokit.kernels.pool import run, spans
+from stereokit.kernels.pool import run
 from stereokit.kernels.workspace import Workspace
 
 __all__ = [
@@ -235,18 +234,16 @@ def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, thr
     if sigma == 0:
         return pair
     held = workspace or Workspace()
-    height, width = pair.left.shape
-    weights = held.once("smooth.taps", sigma, lambda: taps(sigma))
-    shift = 8 if pair.left.dtype == np.uint8 else 0
-    blurred = [held.array(f"smooth.{k}", (height, width), np.uint16) for k in (0, 1)]
+    images = pair.left, pair.right
+    wide, blurred = ([held.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
 
-    def blur(part: int, y0: int, y1: int) -> None:
-        line = held.array(f"smooth.line{part}", width + 2 * (weights.size - 1), np.uint32)
-        total = held.array(f"smooth.total{part}", width, np.uint32)
-        for image, out in zip((pair.left, pair.right), blurred, strict=True):
-            blur_rows(image, weights, shift, y0, y1, line, total, out)
+    def blur(k: int) -> None:
+        image = images[k]
+        if image.dtype == np.uint8:
+            image = np.multiply(image, np.uint16(256), out=wide[k])
+        cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
 
-    run([partial(blur, k, y0, y1) for k, (y0, y1) in enumerate(spans(height, threads))], threads)
+    run([partial(blur, 0), partial(blur, 1)], threads)
     return GrayPair(blurred[0], blurred[1], pair.left_bad, pair.right_bad, pair.guide)
 
 

@@ -93,8 +93,8 @@ class PathBuffers(NamedTuple):
     diagonals: bool
     paths: int
     width: int
-    small: bool  # 4 paths, and 4 costs and a bracket fit a byte
-    few: bool  # what is stored of the other sweep and the brackets along the row fit a byte together
+    small: bool  # 4 paths, no level pads, and 4 costs and a bracket fit a byte
+    few: bool  # no level pads, and what is stored of the other sweep and the brackets along the row fit a byte
     cost: NDArray[np.uint8]
     across: NDArray[Any]
     chains: NDArray[np.uint8]

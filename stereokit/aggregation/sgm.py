@@ -157,6 +157,7 @@ class Sgm:
         both = self.paths != 5
         sums = workspace.array("sgm.sums", height * size if both else 1, sums_dtype)
         kept = workspace.array("sgm.kept", height * width if self.paths == 4 and cost.dear else 0, np.uint8)
+        whole = levels.count == levels.padded  # or the 255 of levels that pad would wrap, and might win
         padding = np.zeros(levels.padded, np.uint8)
         padding[levels.count :] = WORST
         workers = [
@@ -165,8 +166,8 @@ class Sgm:
                 diagonals,
                 self.paths,
                 width,
-                self.paths == 4 and 4 * cost.cost_max + most <= 255,
-                (5 if diagonals else 3) * most + (cost.cost_max if kept.size else 0) <= 255,
+                whole and self.paths == 4 and 4 * cost.cost_max + most <= 255,
+                whole and (5 if diagonals else 3) * most + (cost.cost_max if kept.size else 0) <= 255,
                 workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
                 workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
                 workspace.array(f"sgm.chains{k}", 4 * levels.padded, np.uint8),

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from stereokit.kernels import simd
-from stereokit.kernels.gauss import taps
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.workspace import Workspace
 
@@ -60,16 +57,6 @@ def test_the_smallest_lane_of_each_of_four_vectors(seed):
     out = np.empty(256, np.uint8)
     _lowest(values.ravel(), out)
     np.testing.assert_array_equal(out.reshape(4, 64), np.repeat([[2], [0], [3], [1]], 64, axis=1))
-
-
-@pytest.mark.parametrize("sigma", [0.01, 0.3, 0.6, 2.5, 10])
-def test_taps_are_a_gaussian_that_sums_to_one(sigma):
-    weights = taps(sigma).astype(int)
-    assert weights[0] + 2 * weights[1:].sum() == 2**15
-    shares = [math.exp(-(k * k) / (2 * sigma * sigma)) for k in range(weights.size)]
-    expected = 2**15 * np.array(shares) / (shares[0] + 2 * sum(shares[1:]))
-    assert np.abs(weights[1:] - expected[1:]).max(initial=0) <= 2
-    assert abs(weights[0] - expected[0]) <= weights.size + 1
 
 
 def test_a_workspace_makes_again_what_was_made_for_another_key():

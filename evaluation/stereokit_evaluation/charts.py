@@ -72,10 +72,12 @@ def bars(rows: Sequence[Row], figure: str, name: str) -> dict[str, Any]:
             traces.append(_bar(f"{title(setting)}, {name}", matchers, measured["noc all"], {"color": tint}))
             for region, values in variants.items():
                 values.append(measured[region])
+    heights = [y for values in variants.values() for bars in values for y in bars if y is not None]
+    room = 1.18 * max(heights, default=1.0)  # for the figures above the bars
     layout = {
         "barmode": "group",
         "bargap": 0.18,
-        "yaxis": {"title": {"text": "D1 error, %"}, "rangemode": "tozero"},
+        "yaxis": {"title": {"text": "D1 error, %"}, "range": [0, room]},
         "legend": {"orientation": "h", "y": -0.16},
     }
     return {"data": traces, "layout": layout, "variants": {"y": variants}}

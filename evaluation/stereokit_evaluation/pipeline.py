@@ -19,9 +19,10 @@ from stereokit_evaluation import published
 from stereokit_evaluation._peers import HH, PEERS, THREE_WAY, Call, opencv_threads
 from stereokit_evaluation._rounds import Spread, round_robin, spread
 from stereokit_evaluation._speed_report import Size, format_ms, new_table
-from stereokit_evaluation._stage_times import Watch, watched
+from stereokit_evaluation._stage_times import GROUPS, Watch, watched
 from stereokit_evaluation.grid import Configuration, build, describe_error, settings_at_hand
 from stereokit_evaluation.runner import Matching
+from stereokit_refiners.network import BACKENDS, PRECISIONS
 
 __all__ = ["PipelineRow", "as_json", "print_pipeline", "time_pipeline"]
 
@@ -41,8 +42,8 @@ class PipelineRow:
     threads : int
     seconds : list of float
         Of each run.
-    refine_s : list of float
-        Of these, what the refiner took.
+    parts : dict of lists of float
+        Of these, what each group of stages took (`stereokit_evaluation._stage_times.GROUPS`).
     missing : str or None
         Why it was not timed.
     printed : str or None
@@ -53,7 +54,7 @@ class PipelineRow:
     size: str
     threads: int
     seconds: list[float] = field(default_factory=list)
-    refine_s: list[float] = field(default_factory=list)
+    parts: dict[str, list[float]] = field(default_factory=dict)
     missing: str | None = None
     printed: str | None = None
 
@@ -62,10 +63,10 @@ class PipelineRow:
         """Median and quartiles in milliseconds, None if it was not timed."""
         return spread([1e3 * s for s in self.seconds]) if self.seconds else None
 
-    @property
-    def refine_ms(self) -> float | None:
-        """Median milliseconds of the refiner, None where there is none."""
-        return 1e3 * median(self.refine_s) if any(self.refine_s) else None
+    def part_ms(self, group: str) -> float | None:
+        """Return the median milliseconds of a group of stages, None where there is none."""
+        times = self.parts.get(group, [])
+        return 1e3 * median(times) if any(times) else None
 
 
 def time_pipeline(
@@ -77,6 +78,7 @@ def time_pipeline(
     rows: list[PipelineRow],
     *,
     with_peers: bool = True,
+    runtimes: str | None = None,
     step: Callable[[str], None] = lambda text: None,
 ) -> None:
     """Time the rows of one size and number of threads; they are appended to `rows` before the first run.
@@ -94,6 +96,8 @@ def time_pipeline(
     rows : list of PipelineRow
     with_peers : bool
         OpenCV's 3WAY and HH too.
+    runtimes : str or None
+        A refiner that is timed in each runtime and precision too.
     step : callable
         Called with a few words after each call.
     """
@@ -101,9 +105,9 @@ def time_pipeline(
     calls: dict[str, Callable[[], object]] = {}
     times: dict[str, list[float]] = {}
     with opencv_threads(threads):
-        for configuration in build(methods, settings_at_hand(), options):
-            label, printed = configuration.name, None
-            if configuration.label == "S4":
+        for suffix, configuration in _configurations(methods, options, runtimes):
+            label, printed = configuration.name + suffix, None
+            if configuration.label == "S4" and not suffix:
                 printed = _PRINTED.get(configuration.setting)
             row = PipelineRow(label, size.name, threads, times.setdefault(label, []), printed=printed)
             rows.append(row)
@@ -120,6 +124,18 @@ def time_pipeline(
         round_robin(calls, rounds, times, step=lambda name: step(f"{size.name}, {threads} threads: {name}"))
 
 
+def _configurations(
+    methods: Sequence[str], options: Mapping[str, Any], runtimes: str | None
+) -> list[tuple[str, Configuration]]:
+    """Return what is timed, each with what its name says beyond its setting."""
+    found = [("", configuration) for configuration in build(methods, settings_at_hand(), options)]
+    for backend in BACKENDS if runtimes is not None else ():
+        for precision in PRECISIONS if backend == "openvino" else ("fp32",):
+            chosen = {**options, "backend": backend, "precision": precision}
+            found += [(f", {backend} {precision}", c) for c in build(methods, [str(runtimes)], chosen)]
+    return found
+
+
 def as_json(rows: Sequence[PipelineRow]) -> list[dict[str, Any]]:
     """Return the rows as ``pipeline`` of the JSON."""
     found = []
@@ -134,7 +150,7 @@ def as_json(rows: Sequence[PipelineRow]) -> list[dict[str, Any]]:
                 "median_ms": None if ours is None else ours.median,
                 "q25_ms": None if ours is None else ours.q25,
                 "q75_ms": None if ours is None else ours.q75,
-                "refine_ms": row.refine_ms,
+                "parts_ms": {group: row.part_ms(group) for group in GROUPS},
                 "missing": row.missing,
                 "published_ms": None if row.printed is None else _jetson(row.printed),
                 "published_row": row.printed,
@@ -151,7 +167,7 @@ def print_pipeline(sizes: Sequence[Size], rows: Sequence[PipelineRow]) -> None:
         if not here:
             continue
         table = new_table(f"table II of the paper, {size.name}: {size.width}x{size.height}, {size.levels} levels")
-        for head in ("threads", "ms", "q25-q75", "of it refiner", "published, TX2", "published, AGX"):
+        for head in ("threads", "ms", "q25-q75", *GROUPS, "published, TX2", "published, AGX"):
             table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
         for row in here:
             ours, theirs = row.spread, _jetson(row.printed or "")
@@ -160,7 +176,7 @@ def print_pipeline(sizes: Sequence[Size], rows: Sequence[PipelineRow]) -> None:
                 str(row.threads),
                 "-" if ours is None else format_ms(ours.median),
                 "-" if ours is None else f"{format_ms(ours.q25)}-{format_ms(ours.q75)}",
-                "-" if row.refine_ms is None else format_ms(row.refine_ms),
+                *("-" if (ms := row.part_ms(group)) is None else format_ms(ms) for group in GROUPS),
                 *(f"{theirs[board]:.2f}" if board in theirs else "-" for board in ("TX2", "AGX")),
             )
         console.print(table)
@@ -197,7 +213,8 @@ def _watching(matcher: Any, call: Matching, images: tuple[Any, Any], row: Pipeli
         watch = Watch(time.perf_counter)
         with watched(matcher, watch, groups=True):
             found = call(*images)
-        row.refine_s.append(watch.seconds.get("refine", 0.0))
+        for group in GROUPS:
+            row.parts.setdefault(group, []).append(watch.seconds.get(group, 0.0))
         return found
 
     return run

@@ -61,6 +61,9 @@ def bench(
     pipeline: Annotated[
         bool, typer.Option("--pipeline", help="The paper's table II instead: S4 with each refiner, end to end.")
     ] = False,
+    runtimes: Annotated[
+        str | None, typer.Option(help="With --pipeline: this refiner in every runtime and precision too.")
+    ] = None,
     stages: Annotated[bool, typer.Option("--stages", help="Time the stages of our methods too.")] = False,
     left: Annotated[Path | None, typer.Option(help="Left image, instead of a synthetic one.")] = None,
     right: Annotated[Path | None, typer.Option(help="Right image.")] = None,
@@ -91,7 +94,9 @@ def bench(
     if pipeline and stages:
         raise OptionError("pipeline and stages are two tables, got both; choose one")
     if pipeline:
-        return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, json_file)
+        return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, runtimes, json_file)
+    if runtimes is not None:
+        raise OptionError(f"runtimes must come with pipeline, got {runtimes!r} alone")
     methods = list(dict.fromkeys(parse_method(name) for name in method or METHODS))
     contenders = [*methods, *(peers() if with_peers else ())]
 
@@ -137,19 +142,22 @@ def _pipeline(
     rounds: int,
     pictures: tuple[Gray, Gray] | None,
     with_peers: bool,
+    runtimes: str | None,
     json_file: Path | None,
 ) -> None:
     """Time table II of the paper, print it and write it."""
     rows: list[PipelineRow] = []
     interrupted = False
-    each = len(methods) * len(settings_at_hand()) + 2 * with_peers
+    each = len(methods) * (len(settings_at_hand()) + 5 * (runtimes is not None)) + 2 * with_peers
     about = machine(load())
     with progress(len(sizes) * len(counts) * each * (1 + rounds)) as (console, step):
         try:
             for size in sizes:
                 images = _images(size, pictures)
                 for count in counts:
-                    time_pipeline(size, count, methods, images, rounds, rows, with_peers=with_peers, step=step)
+                    time_pipeline(
+                        size, count, methods, images, rounds, rows, with_peers=with_peers, runtimes=runtimes, step=step
+                    )
         except KeyboardInterrupt:
             interrupted = True
             console.print("interrupted: the figures are those measured so far", highlight=False)

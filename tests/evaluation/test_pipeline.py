@@ -52,8 +52,8 @@ def test_the_json_has_every_row(refiners):
     assert len(rows) == 8 and not any(name.startswith("OpenCV") for name in rows)
     assert rows["S2 Mini+CNN"]["published_ms"] is None
     assert rows["S4 Mini+CNN"]["published_ms"] == {"TX2": 72.1, "AGX": 27.9}
-    assert rows["S4 Mini+CNN"]["runs"] == 2 and rows["S4 Mini+CNN"]["refine_ms"] > 0
-    assert rows["S4 Original"]["refine_ms"] is None and rows["S4 Mini+StereoVAE"]["median_ms"] is None
+    assert rows["S4 Mini+CNN"]["runs"] == 2 and rows["S4 Mini+CNN"]["parts_ms"]["refine"] > 0
+    assert rows["S4 Original"]["parts_ms"]["refine"] is None and rows["S4 Mini+StereoVAE"]["median_ms"] is None
 
 
 def test_the_refiner_is_part_of_the_time(refiners):
@@ -61,8 +61,8 @@ def test_the_refiner_is_part_of_the_time(refiners):
     images = tuple(np.random.default_rng(0).integers(0, 256, (2, 32, 96), np.uint8))
     pipeline.time_pipeline(Size("x", 96, 32, 16), 1, ["S4"], images, 3, rows, with_peers=False)
     linear = next(row for row in rows if row.name == "S4 Mini+Linear")
-    assert len(linear.seconds) == len(linear.refine_s) == 3
-    assert 0 < linear.refine_ms < linear.spread.median
+    assert len(linear.seconds) == len(linear.parts["refine"]) == 3
+    assert 0 < linear.part_ms("refine") < linear.spread.median
 
 
 def test_a_stage_table_is_another_table(refiners):

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from stereokit.errors import OptionError
+from stereokit_refiners.settings import LOSSES
 
 __all__ = ["LOSSES", "distance", "divergence"]
-
-LOSSES = ("l1", "bounded", "d1")
 
 
 def distance(kind: str, error: Tensor, truth: Tensor) -> Tensor:

@@ -144,9 +144,11 @@ def _mix(
                     peak[phase] = max(peak[phase], pixel[5 + 4 * k + phase])
             for k in range(count):
                 for phase in range(4):
-                    fraction, power = _exponential(pixel[5 + 4 * k + phase] - peak[phase])
-                    share[4 * k + phase] = fraction
-                    bits[4 * k + phase] += power << np.int32(23)
+                    share[4 * k + phase] = pixel[5 + 4 * k + phase] - peak[phase]
+            for k in range(4 * count):  # one long loop: vector code
+                fraction, power = _exponential(share[k])
+                share[k] = fraction
+                bits[k] += power << np.int32(23)
             total_0 = np.float32(0)
             total_1 = np.float32(0)
             total_2 = np.float32(0)

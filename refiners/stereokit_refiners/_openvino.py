@@ -9,7 +9,8 @@ a disparity.
 Channels differ in range by a factor of ten and more, and one scale for all would leave the small ones a few steps of
 the 256. A leaky ReLU commutes with positive factors, so each channel is brought to the range 1 where it is made, by
 dividing its weights, and back where it is read, by multiplying those of the reader (Nagel et al. 2019, cross-layer
-equalisation): exact in floating point, and all activations share one scale.
+equalisation): exact in floating point, and all activations share one scale. Only activations that are added to
+others keep one range for all their channels, so that the sum needs no further step.
 """
 
 from __future__ import annotations
@@ -46,13 +47,16 @@ class _OpenVinoOps:
     def conv(self, name: str, inputs: Sequence[Any], *, activate: bool = True) -> Any:
         layer = self.table[name]
         scale = self._scale(name) if activate else None
+        bound = 1.0
+        if scale is not None and (scale == scale[0]).all():  # one range for all: nothing to bring to it
+            bound, scale = float(scale[0]), np.ones_like(scale)
         y = self._convolve(layer, inputs, scale)
         if layer.up:
             y = op.depth_to_space(y, "depth_first", 2)
         if not activate:
             return y
         y = op.prelu(y, _const([0.1]))
-        return y if scale is None else self._rounded(y, 1.0, scale)
+        return y if scale is None else self._rounded(y, bound, scale)
 
     def conv_split(self, name: str, inputs: Sequence[Any]) -> Any:
         return self._convolve(self.table[name], inputs, None)

@@ -186,21 +186,34 @@ def runner(
 def calibrate(module: Module, batches: Iterable[Mapping[str, Tensor]], share: float = 0.999) -> dict[str, list[float]]:
     """Return the range of each channel of each activation.
 
-    It is the largest, over `batches`, of the absolute value that a share of the channel stays below.
+    It is the largest, over `batches`, of the absolute value that a share of the channel stays below; channels of an
+    activation that is added to another have one range, the largest of theirs.
     """
     ranges: dict[str, Tensor] = {}
+    added: set[str] = set()
 
     class Watching(_TorchOps):
+        def __init__(self, module: Module) -> None:
+            super().__init__(module)
+            self.names: dict[int, tuple[str, Tensor]] = {}  # with the tensor, so that its id stays its own
+
         def activate(self, name: str, x: Tensor) -> Tensor:
             y = super().activate(name, x)
             size = y.abs().transpose(0, 1).flatten(1).float()
             kept = max(1, round(size.shape[1] * (1 - share)))
             bound = size.topk(kept, dim=1).values[:, -1]
             ranges[name] = torch.maximum(ranges[name], bound) if name in ranges else bound
+            self.names[id(y)] = name, y
             return y
+
+        def add(self, a: Tensor, b: Tensor) -> Tensor:
+            added.update(self.names[id(x)][0] for x in (a, b) if id(x) in self.names)
+            return super().add(a, b)
 
     module.eval()
     with torch.inference_mode():
         for inputs in batches:
             module.network.forward(Watching(module), inputs)
+    for name in added:
+        ranges[name] = torch.full_like(ranges[name], float(ranges[name].max()))
     return {name: [float(f"{value:.4g}") for value in bound.tolist()] for name, bound in ranges.items()}

@@ -37,6 +37,7 @@ from stereokit_evaluation.runner import (
     from_files,
     run,
     score_frames,
+    seen_in_training,
     with_matcher,
 )
 
@@ -56,6 +57,7 @@ class _Run:
     scale: float | None = None
     refiner: str | None = None
     device: str | None = None
+    matcher: Any = None
 
 
 def evaluate(
@@ -96,6 +98,9 @@ def evaluate(
         options = {"max_disparity": max_disparity, "threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
         methods = method or [_DEFAULT_METHOD]
         runs = [_matcher_run(name, scale, refiner, device, options, color) for name in methods]
+    seen = (seen_in_training(job.matcher, dataset, chosen) for job in runs)
+    for line in dict.fromkeys(line for line in seen if line is not None):
+        typer.echo(f"note: {line}", err=True)
     results, interrupted = _execute(runs, chosen, error_maps)
     skipped = list(dict.fromkeys(skip for result in results for skip in result.skipped))
     document = {
@@ -121,7 +126,7 @@ def _matcher_run(
 
     matcher = Matcher(method, scale=scale, refiner=refiner, device=device, **options)
     estimate = with_matcher(matcher, gray=not color)
-    return _Run(estimate, str(matcher.method), scale, refiner, str(matcher.device))
+    return _Run(estimate, str(matcher.method), scale, refiner, str(matcher.device), matcher)
 
 
 def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -> tuple[list[Result], bool]:

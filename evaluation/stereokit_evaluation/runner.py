@@ -30,6 +30,7 @@ __all__ = [
     "from_files",
     "run",
     "score_frames",
+    "seen_in_training",
     "with_matcher",
 ]
 
@@ -167,6 +168,27 @@ def score_frames(
         if observe is not None:
             observe(frame, found, noc, occ)
         yield Scored(frame.name, result, found.seconds)
+
+
+def seen_in_training(matcher: object, dataset: str, frames: Iterable[Frame]) -> str | None:
+    """Return a line that says how many of the frames a matcher's refiner was trained on, None if on none.
+
+    Parameters
+    ----------
+    matcher : object
+        A `stereokit.Matcher`, whose refiner may tell what it was ``trained_on``.
+    dataset : str
+        Name of the data set that the frames are of.
+    frames : iterable of Frame
+    """
+    refiner = getattr(matcher, "_refine", None)
+    known: frozenset[str] = getattr(refiner, "trained_on", frozenset())
+    every = list(frames)
+    seen = sum(f"{dataset}/{frame.name}" in known for frame in every)
+    if not seen:
+        return None
+    name = getattr(matcher, "refiner", None)
+    return f"refiner {name!r} was trained on {seen} of these {len(every)} frames: on those its errors say little"
 
 
 def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:

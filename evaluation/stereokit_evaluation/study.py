@@ -29,6 +29,7 @@ from stereokit_evaluation.datasets import load, select
 from stereokit_evaluation.frames import Frame
 from stereokit_evaluation.grid import build, parse_setting, peer, settings_at_hand
 from stereokit_evaluation.published import PAPER
+from stereokit_evaluation.runner import seen_in_training
 from stereokit_evaluation.splits import comparison, count_frames, split
 from stereokit_evaluation.study_run import Study, run_study
 from stereokit_evaluation.study_store import Store
@@ -104,6 +105,8 @@ def study(
                 settings=train_settings or (),
             )  # fmt: skip
     configurations = build(methods, wanted, options, trained)
+    seen = (seen_in_training(c.matcher, dataset, chosen) for c in configurations)
+    warnings += dict.fromkeys(line for line in seen if line is not None)
     if with_peers:
         configurations += [peer(key, levels) for key in (THREE_WAY, HH)]
     about = machine(system_load())

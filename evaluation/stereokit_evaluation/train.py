@@ -88,6 +88,9 @@ def train(
     everything = [] if dataset is None else list(load(dataset, root))
     groups = _groups(everything, frames, validation, folds)
     more = _extra(extra or ())
+    tested_names = {f"{dataset}/{frame.name}" for _, part in groups for frame in part}
+    if common := sorted(tested_names & more.keys()):
+        raise OptionError(f"extra must not bring frames that are held out, got {common[0]!r}")
     if dataset is not None and not all(training for training, _ in groups):
         raise OptionError("frames must leave some to train on beside those held out, got none")
     for frame in (*more.values(), *(f for pair in groups for part in pair for f in part)):
@@ -141,7 +144,8 @@ def train(
         folder = output if folds is None else output / f"fold-{number}"
         where = [(frame.name, name) for frame in held_out for name in methods]
         looked_at = [sample for frame in held_out for sample in truth[frame.name]]
-        outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world)
+        seen = [*(f"{dataset}/{frame.name}" for frame in training), *more]
+        outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world, seen)
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})
     if world[0] > 0:
         return
@@ -200,7 +204,11 @@ def _extra(given: Sequence[str]) -> dict[str, Frame]:
         dataset, colon, root = text.partition(":")
         if not colon or not root:
             raise OptionError(f"extra must be DATASET:ROOT, got {text!r}")
-        frames.update({f"{text}/{frame.name}": frame for frame in load(dataset, root)})
+        for frame in load(dataset, root):
+            name = f"{dataset}/{frame.name}"
+            if name in frames:
+                raise OptionError(f"extra must not bring two frames called {name!r}, got {text!r}")
+            frames[name] = frame
     return frames
 
 
@@ -215,7 +223,7 @@ def _join_group(torch: Any) -> tuple[int, int]:
 
 def _train_one(
     refiner: str, sources: Any, looked_at: Sequence[Any], where: Sequence[tuple[str, str]], settings: Any, start: Any,
-    folder: Path, world: tuple[int, int],
+    folder: Path, world: tuple[int, int], seen: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
     """Train, calibrate, write the folder; return the counts of bad and known pixels by matcher."""
     from stereokit_refiners.training import bad_pixels, calibrated, fit, predict, restored
@@ -245,7 +253,11 @@ def _train_one(
         total[1] += known
     if world[0] == 0:
         ranges = calibrated(module, settings.form, sources)
-        notes = {"settings": asdict(settings), "start": None if start is None else start.fingerprint}
+        notes = {
+            "frames": sorted(seen),
+            "settings": asdict(settings),
+            "start": None if start is None else start.fingerprint,
+        }
         write(folder / "weights.safetensors", WeightFile(refiner, settings.form, arrays, ranges, notes))
         write_bytes(folder / "curves.csv", history.csv())
         write_bytes(folder / "curves.png", _curves(history))

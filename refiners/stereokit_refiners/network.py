@@ -113,6 +113,11 @@ class LearnedRefiner:
         """What the result depends on, beside the inputs."""
         return f"{self._file.fingerprint}-{self.backend}-{self.precision}"
 
+    @property
+    def trained_on(self) -> frozenset[str]:
+        """The frames that the weights were trained on, ``DATASET/NAME``, as far as their file says."""
+        return frozenset(str(name) for name in self._file.notes.get("frames", ()))
+
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the refined map at the size of `left`; see `stereokit_refiners.refiner.Refiner`.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
 from stereokit_evaluation import datasets
 from stereokit_evaluation.evaluate import evaluate, run
+from stereokit_evaluation.frames import Frame
 from stereokit_evaluation.runner import Skipped, score_frames, with_matcher
 
 SHAPE = (8, 12)
@@ -346,3 +348,16 @@ def test_help_names_the_options():
     done = CliRunner(env={"COLUMNS": "200", "TERM": "dumb"}).invoke(WORKERS, ["--help"])
     for option in ("--dataset", "--root", "--frames", "--method", "--predictions", "--json", "--set"):
         assert option in done.output
+
+
+def test_frames_that_a_refiner_was_trained_on_are_told_of():
+    from stereokit_evaluation.runner import seen_in_training
+
+    frames = [Frame(name, Path("l"), Path("r")) for name in ("a", "b", "c")]
+    refiner = SimpleNamespace(trained_on=frozenset({"set/a", "set/c", "other/b"}))
+    matcher = SimpleNamespace(refiner="mine", _refine=refiner)
+    line = seen_in_training(matcher, "set", frames)
+    assert line is not None and "'mine' was trained on 2 of these 3 frames" in line
+    assert seen_in_training(matcher, "elsewhere", frames) is None
+    assert seen_in_training(SimpleNamespace(_refine=None), "set", frames) is None
+    assert seen_in_training(object(), "set", frames) is None

@@ -36,8 +36,10 @@ about 10 GB/s beyond its caches (6 ms per volume); operations are those on vecto
     vertical path and sum            33           caches        4.2 ms    8.5 ms
     selection                        10 + 15      caches        3.2 ms    3.5 ms
 
-The volume lives outside the caches: its two passes are bound by memory, the rest by the arithmetic. The sum stays
-furthest from its bound: widening bytes to words takes half of its operations, on ports that few of them share.
+The volume lives outside the caches: its two passes are bound by memory, the rest by the arithmetic. So it is written
+past the caches, which spares reading it first, and asked for `CHUNK` pixels ahead of its use, as the processor's own
+prefetching ends with every page. The sum stays furthest from its bound: widening bytes to words takes half of its
+operations, on ports that few of them share.
 """
 
 from __future__ import annotations
@@ -61,11 +63,14 @@ from stereokit.kernels.simd import (
     lowest_of_4,
     minimum,
     multiply,
+    prefetch,
     shift_down,
     shift_up,
     splat,
     splat_at,
     store,
+    stream,
+    stream_end,
     subtract,
 )
 
@@ -74,7 +79,6 @@ __all__ = ["CHUNK", "PathBuffers", "Penalties", "finish_part", "first_visit", "p
 
 CHUNK = 32
 """Pixels whose sums are selected while they are still in the first-level cache."""
-
 
 class Penalties(NamedTuple):
     """P1 and P2 of a step, in steps of cost."""
@@ -234,14 +238,14 @@ def _horizontals(buffers: PathBuffers, rows: int) -> None:
 
 @inline
 def _verticals(
-    buffers: PathBuffers, slot: int, k: int, x0: int, x1: int, sums: NDArray[Any], base: int, last: bool, stored: bool
-) -> None:
+    buffers: PathBuffers, slot: int, k: int, x0: int, x1: int, sums: NDArray[Any], base: int, last: bool, stored: bool,
+    past: bool,
+) -> None:  # fmt: skip
     """Advance the paths from the row before to sweep row `k`, columns x0..x1.
 
     `slot` says which of the two rows in the buffers it is. Before the last visit the sum of their brackets (or the
-    path costs, if those are kept) goes to ``sums[base:]``;
-    at the last one everything is summed into `total`, with what the other sweep left in `sums` if
-    `stored`.
+    path costs, if those are kept) goes to ``sums[base:]``, `past` the caches or through them; at the last one
+    everything is summed into `total`, with what the other sweep left in `sums` if `stored`.
     """
     width = buffers.width
     padded = LANES * len(buffers.blocks)
@@ -339,6 +343,8 @@ def _verticals(
                     total = convert(add(add(twice, cost if kept else twice), bracket_b), wide)
                 else:
                     total = add(convert(part, wide), multiply(convert(cost, wide), times))
+                if stored and not kept:
+                    prefetch(sums, base + at + CHUNK * padded)
                 across = load(buffers.across, here + at)
                 if stored and buffers.few:
                     others = add(convert(across, narrow), convert(load(sums, base + at), narrow))
@@ -348,10 +354,12 @@ def _verticals(
                     if stored:
                         total = add(total, convert(load(sums, base + at), wide))
                 store(buffers.total, at - x0 * padded, total)
-            elif kept:
-                store(sums, base + at, convert(path_b, like))
             else:
-                store(sums, base + at, part)
+                remains = convert(path_b, like) if kept else part
+                if past:
+                    stream(sums, base + at, remains)
+                else:
+                    store(sums, base + at, remains)
         if buffers.diagonals:
             one, two, three, _ = lowest_of_4(smallest_a, smallest_b, smallest_c, smallest_c)
             least[slot_a] = first_lane(one)
@@ -367,16 +375,23 @@ def _verticals(
 @kernel
 def first_visit(
     rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int,
-    sums: NDArray[Any],
+    sums: NDArray[Any], near: int,
 ) -> None:  # fmt: skip
-    """Sweep from row `y0` to before row `y1` (upwards when y1 < y0); leave the brackets in `sums`."""
+    """Sweep from row `y0` to before row `y1` (upwards when y1 < y0); leave the brackets in `sums`.
+
+    The last `near` elements are written through the caches, all before them past the caches.
+    """
     step = 1 if y1 > y0 else -1
     size = buffers.width * LANES * len(buffers.blocks)
     for k in range(abs(y1 - y0)):
         y = y0 + k * step
         cost_row(rows, y, buffers.cost)
         _look_up(guide, y, step, buffers.diagonals, False, penalties, 0, buffers.penalties)
-        _verticals(buffers, 0, k, 0, buffers.width, sums, y * size, False, False)
+        if (abs(y1 - y0) - k) * size > near:
+            _verticals(buffers, 0, k, 0, buffers.width, sums, y * size, False, False, True)
+        else:
+            _verticals(buffers, 0, k, 0, buffers.width, sums, y * size, False, False, False)
+    stream_end()
 
 
 @inline
@@ -415,6 +430,7 @@ def recover_row(
             bracket = _bracket(below, here, above, p1_b, p2_b)
             if first:
                 bracket = zero
+            prefetch(sums, source + block + CHUNK * padded)
             cost = subtract(convert(load(sums, at + block), narrow), bracket)
             if n + 1 == len(buffers.blocks):
                 cost = either(cost, load(buffers.padding, block))
@@ -450,6 +466,6 @@ def finish_part(
     The sums go to the beginning of ``buffers.total``.
     """
     if stored:
-        _verticals(buffers, slot, k, x0, x1, sums, y * buffers.width * LANES * len(buffers.blocks), True, True)
+        _verticals(buffers, slot, k, x0, x1, sums, y * buffers.width * LANES * len(buffers.blocks), True, True, False)
     else:
-        _verticals(buffers, slot, k, x0, x1, sums, 0, True, False)
+        _verticals(buffers, slot, k, x0, x1, sums, 0, True, False, False)

@@ -32,6 +32,9 @@ from stereokit.selection.wta import Winners, select_row
 
 __all__ = ["Sgm"]
 
+NEAR = 4 << 20
+"""Elements that a first visit writes last and leaves in the caches: the last visits begin where the first ones end."""
+
 
 @AGGREGATIONS.register("sgm")
 @dataclass(frozen=True)
@@ -130,7 +133,7 @@ class Sgm:
 
         def first(k: int, y0: int, y1: int) -> None:
             start(workers[k])
-            first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums)
+            first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
 
         def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
             _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, keep)

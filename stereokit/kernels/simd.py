@@ -49,6 +49,7 @@ __all__ = [
     "multiply",
     "multiply_high",
     "multiply_pairs",
+    "prefetch",
     "shift_down",
     "shift_left",
     "shift_right",
@@ -56,6 +57,8 @@ __all__ = [
     "splat",
     "splat_at",
     "store",
+    "stream",
+    "stream_end",
     "subtract",
     "vector_bits",
     "xor",
@@ -150,6 +153,53 @@ def store(typing: Any, array: Any, offset: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), generate
+
+
+@intrinsic
+def prefetch(typing: Any, array: Any, offset: Any) -> Any:
+    """Ask for the 64 bytes around element `offset` of the flat `array`, which may lie behind its end, in the caches."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        where = builder.bitcast(builder.gep(data, [args[1]]), ir.PointerType(ir.IntType(8)))
+        hints = [ir.Constant(_I32, value) for value in (0, 2, 1)]  # to read, into the second level, data
+        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [where, *hints])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
+@intrinsic
+def stream(typing: Any, array: Any, offset: Any, value: Any) -> Any:
+    """Write the lanes of `value` past the caches into the flat `array`, whose element `offset` is 64-byte aligned.
+
+    For what is not read again before the caches have lost it: memory is written without being read first. Another
+    thread sees it after `stream_end`. Processors without such stores write as `store` does.
+    """
+    if not isinstance(value, Vector) or value.scalar != array.dtype:
+        return None
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = _pointer(context, builder, signature.args[0], args[0], args[1])
+        written = builder.store(args[2], pointer, align=64)
+        written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(_I32, 1)]))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), generate
+
+
+@intrinsic
+def stream_end(typing: Any) -> Any:
+    """Let what was streamed be seen before anything that this thread writes from here on."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if binding.get_process_triple().startswith("x86_64"):
+            _call(builder, "llvm.x86.sse.sfence", ir.VoidType(), [])
+        else:
+            builder.fence("seq_cst")
+        return context.get_dummy_value()
+
+    return types.void(), generate
 
 
 @intrinsic

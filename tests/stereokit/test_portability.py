@@ -15,11 +15,13 @@ SCRIPT = """
 import hashlib
 import numpy as np
 import stereokit
+from stereokit.aggregation import sgm
 
 rng = np.random.default_rng(0)
 left = rng.integers(0, 256, (21, 45), dtype=np.uint8)
 right = (np.roll(left, -5, axis=1) // 2 + rng.integers(0, 40, left.shape)).astype(np.uint8)
-for method in stereokit.METHODS.values():
+for near, method in [(near, method) for near in (sgm.NEAR, 0) for method in stereokit.METHODS.values()]:
+    sgm.NEAR = near  # 0: all is streamed, as with images that are larger than the caches
     result = stereokit.Matcher(method, max_disparity=16, confidence=True, threads=1)(left, right)
     digest = hashlib.sha256()
     for array in (result.disparity, result.valid, result.confidence):
@@ -44,4 +46,9 @@ def test_a_processor_with_avx2_and_no_more_gives_the_same_bits(run_python, nativ
 
 
 def test_all_four_methods_are_compared(native):
-    assert len(native.splitlines()) == 4
+    assert len(native.splitlines()) == 8
+
+
+def test_sums_that_are_streamed_give_the_same_bits(native):
+    lines = native.splitlines()
+    assert lines[:4] == lines[4:]

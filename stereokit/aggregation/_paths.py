@@ -80,6 +80,7 @@ __all__ = ["CHUNK", "PathBuffers", "Penalties", "finish_part", "first_visit", "p
 CHUNK = 32
 """Pixels whose sums are selected while they are still in the first-level cache."""
 
+
 class Penalties(NamedTuple):
     """P1 and P2 of a step, in steps of cost."""
 

@@ -10,9 +10,13 @@ from __future__ import annotations
 
 import hashlib
 import io
+import zipfile
+import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import cv2
 import numpy as np
@@ -20,11 +24,13 @@ from numpy.typing import NDArray
 
 import stereokit
 from stereokit.defaults import DEFAULTS
+from stereokit.errors import FileError
 from stereokit.io import make_folder, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
+from stereokit_refiners.augment import Views, mirrored, moved_objects, photographed, rescaled
 
-__all__ = ["Crop", "Pair", "Sample", "crop", "load_variant", "make_variant", "whole"]
+__all__ = ["Crop", "Pair", "Sample", "Shelf", "crop", "load_variant", "make_variant", "store_variant", "whole"]
 
 _STEP = np.float32(1 / 256)  # maps are kept as KITTI keeps them
 
@@ -48,7 +54,7 @@ class Pair:
     noc: NDArray[np.float32]
     occ: NDArray[np.float32]
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """A fingerprint of the content."""
         found = hashlib.sha256()
@@ -181,14 +187,16 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     -------
     Sample
     """
-    left, right, noc, occ = pair.left, pair.right, pair.noc, pair.occ
+    views = Views(pair.left, pair.right, pair.noc, pair.occ)
     options: dict[str, Any] = {}
     if number > 0:
         rng = np.random.default_rng([seed, number, int(pair.digest[:8], 16)])
-        left, right, noc, occ = _rescaled(rng, left, right, noc, occ)
-        left, right = _photographed(rng, left, right)
+        if number % 2 == 0:
+            views = mirrored(views)
+        views = photographed(rng, rescaled(rng, moved_objects(rng, views)))
         options = _drawn_options(rng, method)
-    left, right = _even(left), _even(right)
+    noc, occ = views.noc, views.occ
+    left, right = _even(views.left), _even(views.right)
     matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, **options)
     found = matcher(half(left), half(right))
     height, width = left.shape
@@ -212,37 +220,6 @@ def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
 
 
-def _rescaled(
-    rng: np.random.Generator, left: NDArray[Any], right: NDArray[Any], noc: NDArray[Any], occ: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return the pair at a random size; the truth's disparities follow the width."""
-    across = float(np.exp(rng.normal(0, 0.18)))
-    down = float(np.clip(across * np.exp(rng.normal(0, 0.1)), 0.6, 1.6))
-    across = float(np.clip(across, 0.6, 1.6))
-    rows, columns = left.shape
-    size = (max(64, round(columns * across)), max(64, round(rows * down)))
-    shrinks = across < 1 and down < 1
-    images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR) for i in (left, right)]
-    factor = np.float32(size[0] / columns)
-    maps = [cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT) * factor for m in (noc, occ)]
-    return images[0], images[1], maps[0], maps[1]
-
-
-def _photographed(
-    rng: np.random.Generator, left: NDArray[Any], right: NDArray[Any]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return both views under another exposure, slightly different between them, with noise."""
-    gamma, gain = float(np.exp(rng.normal(0, 0.15))), float(np.exp(rng.normal(0, 0.12)))
-    noise = float(rng.exponential(1.0))
-    views = []
-    for view in (left, right):
-        own_gain, offset = float(np.exp(rng.normal(0, 0.02))), float(rng.normal(0, 1.5))
-        curve = 255 * (np.arange(256) / 255) ** gamma * gain * own_gain + offset
-        values = curve.astype(np.float32)[view] + np.float32(noise) * rng.standard_normal(view.shape, np.float32)
-        views.append(np.clip(np.rint(values), 0, 255).astype(np.uint8))
-    return views[0], views[1]
-
-
 def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
     """Return the matcher's options, drawn around the defaults of `stereokit.defaults`."""
     name = parse_method(method)
@@ -263,7 +240,8 @@ def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
 
 def cache_name(pair: Pair, method: str, seed: int, number: int, max_disparity: int) -> str:
     """Return the file name of a variant: all that it depends on."""
-    own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
+    here = Path(__file__)
+    own = hashlib.sha256(here.read_bytes() + here.with_name("augment.py").read_bytes()).hexdigest()[:8]
     which = f"{pair.digest}-{method.lower().replace('+', '_')}-{max_disparity}-{seed}-{number}"
     return f"{which}-{FINGERPRINT}-{own}.npz"
 
@@ -272,16 +250,56 @@ def load_variant(
     pair: Pair, method: str, seed: int, number: int, max_disparity: int = 128, cache: Path | None = None
 ) -> Sample:
     """Return a variant, from the cache folder if it is there; otherwise make it and keep it."""
-    path = None if cache is None else cache / cache_name(pair, method, seed, number, max_disparity)
-    if path is not None and path.exists():
-        with np.load(path) as held:
-            return Sample(
-                held["coarse"], held["valid"], held["left"], held["truth"], held["seen"], tuple(held["size"].tolist())
-            )
-    sample = make_variant(pair, method, seed, number, max_disparity)
-    if path is not None:
+    if cache is None:
+        return make_variant(pair, method, seed, number, max_disparity)
+    return _read(store_variant(pair, method, seed, number, max_disparity, cache))
+
+
+def store_variant(pair: Pair, method: str, seed: int, number: int, max_disparity: int, cache: Path) -> Path:
+    """Return the file of a variant in the cache folder; make it if it is not there."""
+    path = cache / cache_name(pair, method, seed, number, max_disparity)
+    if not path.exists():
+        sample = make_variant(pair, method, seed, number, max_disparity)
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **{k: np.asarray(v) for k, v in vars(sample).items()})
         make_folder("cache", path.parent)
         write_bytes(path, buffer.getvalue())
-    return sample
+    return path
+
+
+def _read(path: Path) -> Sample:
+    try:
+        with np.load(path) as held:
+            return Sample(
+                held["coarse"], held["valid"], held["left"], held["truth"], held["seen"], tuple(held["size"].tolist())
+            )
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise FileError(f"cache must hold samples of this program, cannot read {str(path)!r} ({error})") from None
+
+
+class Shelf(Sequence[Sample]):
+    """Samples in files, read each time one is asked for: as many as the disk holds, in little memory.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files of `store_variant`.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = list(paths)
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> Shelf: ...
+    def __getitem__(self, index: int | slice) -> Sample | Shelf:
+        return Shelf(self._paths[index]) if isinstance(index, slice) else _read(self._paths[index])
+
+    @property
+    def digest(self) -> int:
+        """A number that says which samples these are: their names tell all that they depend on."""
+        return zlib.crc32("/".join(path.name for path in self._paths).encode())

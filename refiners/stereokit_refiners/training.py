@@ -29,7 +29,7 @@ from stereokit_refiners._torch import Module, calibrate, compose
 from stereokit_refiners.encode import check_form, encode
 from stereokit_refiners.layers import Network, Weights
 from stereokit_refiners.losses import distance, divergence
-from stereokit_refiners.samples import Crop, Sample, crop, whole
+from stereokit_refiners.samples import Crop, Sample, Shelf, crop, whole
 from stereokit_refiners.settings import PRESETS, Settings
 
 __all__ = ["PRESETS", "History", "Settings", "Source", "bad_pixels", "calibrated", "fit", "predict", "restored"]
@@ -326,6 +326,8 @@ def _described(
     """Return all that a training depends on, for the checkpoint."""
 
     def digest(samples: Sequence[Sample]) -> int:
+        if isinstance(samples, Shelf):
+            return samples.digest
         found = 0
         for sample in samples:
             for array in (sample.coarse, sample.left, sample.truth):

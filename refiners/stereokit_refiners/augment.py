@@ -66,7 +66,7 @@ def moved_objects(rng: np.random.Generator, views: Views, most: int = 3) -> View
 
 
 def _objects(views: Views) -> list[tuple[Views, NDArray[np.bool_], NDArray[np.float32]]]:
-    """Return (where it comes from, its pixels in the left view, its disparity there) of every object, seen both ways."""
+    """Return every object, seen both ways: the pair it is of, its pixels in the left view, its disparity there."""
     found = []
     for origin in (views, mirrored(views)):
         known = np.isfinite(origin.noc)
@@ -100,7 +100,7 @@ def _pasted(
         hidden = views.noc[y, x + shift] > np.where(np.isnan(d), nearest, d) + 1
     if not len(y) or np.mean(hidden) > 0.02:
         return views
-    there = np.zeros((height, width), np.uint8)  # the object in the right view, where it comes from
+    there: NDArray[Any] = np.zeros((height, width), np.uint8)  # the object in the right view, where it comes from
     own = ~np.isnan(d)
     columns = np.rint(x[own] - d[own]).astype(np.int64)
     seen = (columns >= 0) & (columns < width)

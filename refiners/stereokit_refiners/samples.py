@@ -33,6 +33,9 @@ from stereokit_refiners.augment import Views, mirrored, moved_objects, photograp
 __all__ = ["Crop", "Pair", "Sample", "Shelf", "crop", "load_variant", "make_variant", "store_variant", "whole"]
 
 _STEP = np.float32(1 / 256)  # maps are kept as KITTI keeps them
+_HERE = Path(__file__)
+_SOURCES = _HERE.read_bytes() + _HERE.with_name("augment.py").read_bytes()
+_OWN = hashlib.sha256(_SOURCES).hexdigest()[:8]  # says what made a cached sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +74,8 @@ class Sample:
     ----------
     coarse : (h, w) uint16
         Coarse map in 1/256 half-size pixels, filled.
-    valid : (h, w) bool
-        Where it was measured.
+    confidence : (h, w) uint8
+        The matcher's confidence in 1/255, 0 where nothing was measured.
     left : (2h, 2w) uint8
     truth : (2h, 2w) uint16
         1/256 full-size pixels, 0 unknown.
@@ -83,7 +86,7 @@ class Sample:
     """
 
     coarse: NDArray[np.uint16]
-    valid: NDArray[np.bool_]
+    confidence: NDArray[np.uint8]
     left: NDArray[np.uint8]
     truth: NDArray[np.uint16]
     seen: NDArray[np.bool_]
@@ -98,7 +101,8 @@ class Crop:
     ----------
     disparity : (h, w) float32
         Coarse map in full-size pixels.
-    valid : (h, w) bool
+    confidence : (h, w) float32
+        0 to 1, 0 where nothing was measured.
     left : (2h, 2w) float32
         Grey levels, 0 to 255.
     truth : (2h, 2w) float32
@@ -109,7 +113,7 @@ class Crop:
     """
 
     disparity: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    confidence: NDArray[np.float32]
     left: NDArray[np.float32]
     truth: NDArray[np.float32]
     weight: NDArray[np.float32]
@@ -122,7 +126,7 @@ def _cut(sample: Sample, y: int, x: int, rows: int, columns: int) -> Crop:
     weight = np.where(truth > 0, np.where(sample.seen[large], np.float32(2), np.float32(1)), np.float32(0))
     return Crop(
         sample.coarse[small] * (np.float32(2) * _STEP),
-        sample.valid[small],
+        sample.confidence[small] * np.float32(1 / 255),
         sample.left[large].astype(np.float32),
         truth * _STEP,
         weight.astype(np.float32),
@@ -144,11 +148,11 @@ def crop(sample: Sample, rows: int, columns: int, rng: np.random.Generator) -> C
     left = np.clip((values - np.float32(128)) * np.float32(contrast) + np.float32(128 + level), 0, 255)
     more = ((0, rows - part.disparity.shape[0]), (0, columns - part.disparity.shape[1]))
     if more == ((0, 0), (0, 0)):
-        return Crop(part.disparity, part.valid, left.astype(np.float32), part.truth, part.weight)
+        return Crop(part.disparity, part.confidence, left.astype(np.float32), part.truth, part.weight)
     twice = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
-        np.pad(part.valid, more, mode="edge"),
+        np.pad(part.confidence, more, mode="edge"),
         np.pad(left, twice, mode="edge").astype(np.float32),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -163,7 +167,7 @@ def whole(sample: Sample, multiple: int) -> Crop:
     twice = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
-        np.pad(part.valid, more, mode="edge"),
+        np.pad(part.confidence, more, mode="edge"),
         np.pad(part.left, twice, mode="edge"),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -197,7 +201,7 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
         options = _drawn_options(rng, method)
     noc, occ = views.noc, views.occ
     left, right = _even(views.left), _even(views.right)
-    matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, **options)
+    matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, confidence=True, **options)
     found = matcher(half(left), half(right))
     height, width = left.shape
     truth = np.zeros((height, width), np.uint16)
@@ -207,7 +211,9 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     known = np.where(np.isfinite(noc), noc, occ)
     truth[:rows, :columns] = np.where(np.isfinite(known), np.clip(np.rint(known / _STEP), 1, 65535), 0)
     coarse = np.clip(np.rint(found.disparity / _STEP), 0, 65535).astype(np.uint16)
-    return Sample(coarse, found.valid, left, truth, seen, (rows, columns))
+    assert found.confidence is not None
+    confidence = np.clip(np.rint(found.confidence * 255), 0, 255).astype(np.uint8)
+    return Sample(coarse, confidence, left, truth, seen, (rows, columns))
 
 
 def half(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -240,10 +246,8 @@ def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
 
 def cache_name(pair: Pair, method: str, seed: int, number: int, max_disparity: int) -> str:
     """Return the file name of a variant: all that it depends on."""
-    here = Path(__file__)
-    own = hashlib.sha256(here.read_bytes() + here.with_name("augment.py").read_bytes()).hexdigest()[:8]
     which = f"{pair.digest}-{method.lower().replace('+', '_')}-{max_disparity}-{seed}-{number}"
-    return f"{which}-{FINGERPRINT}-{own}.npz"
+    return f"{which}-{FINGERPRINT}-{_OWN}.npz"
 
 
 def load_variant(
@@ -271,7 +275,12 @@ def _read(path: Path) -> Sample:
     try:
         with np.load(path) as held:
             return Sample(
-                held["coarse"], held["valid"], held["left"], held["truth"], held["seen"], tuple(held["size"].tolist())
+                held["coarse"],
+                held["confidence"],
+                held["left"],
+                held["truth"],
+                held["seen"],
+                tuple(held["size"].tolist()),
             )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise FileError(f"cache must hold samples of this program, cannot read {str(path)!r} ({error})") from None

@@ -72,7 +72,7 @@ def _device() -> torch.device:
 def _batch(network: Network, form: str, crops: Sequence[Crop]) -> dict[str, Tensor]:
     """Return crops as tensors: the network's inputs, and ``coarse``, ``truth``, ``weight``, all (B, C, ., .)."""
     names = tuple(network.inputs)
-    encoded = [encode(names, form, c.disparity, c.valid, c.left) for c in crops]
+    encoded = [encode(names, form, c.disparity, c.confidence, c.left) for c in crops]
     arrays = {name: np.stack([inputs[name] for inputs in encoded]) for name in names}
     arrays["coarse"] = np.stack([c.disparity[None] for c in crops])
     arrays["truth"] = np.stack([c.truth[None] for c in crops])

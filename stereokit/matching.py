@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Levels, Pair
-from stereokit.defaults import DEFAULTS, METHODS
+from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import (
     GrayPair,
@@ -137,7 +137,7 @@ class Matcher:
         cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         cost_options, aggregation_options = option_names(cost), option_names(aggregation)
         check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options, *elsewhere}))
-        merged = {**DEFAULTS[""], **DEFAULTS.get(self.method, {}), **options}
+        merged = {**defaults_of(self.method, half=self.scale == 0.5), **options}
         self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
         if "p2" not in options and "p2" in merged:  # a default gives way to what the cost leaves of 8 bits
             merged["p2"] = min(merged["p2"], (255 - self.cost.cost_max) / self.cost.unit)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stereokit
-from stereokit.defaults import DEFAULTS
+from stereokit.defaults import HALF, defaults_of
 from stereokit.errors import FileError
 from stereokit.io import make_folder, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
@@ -192,13 +192,13 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     Sample
     """
     views = Views(pair.left, pair.right, pair.noc, pair.occ)
-    options: dict[str, Any] = {}
+    options = dict(HALF.get(parse_method(method), {}))
     if number > 0:
         rng = np.random.default_rng([seed, number, int(pair.digest[:8], 16)])
         if number % 2 == 0:
             views = mirrored(views)
         views = photographed(rng, rescaled(rng, moved_objects(rng, views)))
-        options = _drawn_options(rng, method)
+        options |= _drawn_options(rng, method)
     noc, occ = views.noc, views.occ
     left, right = _even(views.left), _even(views.right)
     matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, confidence=True, **options)
@@ -229,7 +229,7 @@ def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
     """Return the matcher's options, drawn around the defaults of `stereokit.defaults`."""
     name = parse_method(method)
-    base = {**DEFAULTS[""], **DEFAULTS.get(name, {})}
+    base = defaults_of(name, half=True)
     options: dict[str, Any] = {
         "smooth": float(np.clip(base["smooth"] * np.exp(rng.normal(0, 0.15)), 0.3, 1.2)),
         "speckle": float(base["speckle"] * np.exp(rng.normal(0, 0.4))),

@@ -115,6 +115,8 @@ def _pasted(
     ys, xs = np.nonzero(np.isfinite(noc))
     behind = np.rint(xs - noc[ys, xs]).astype(np.int64)
     lost = (behind >= 0) & covers[ys, np.clip(behind, 0, width - 1)]
+    if np.count_nonzero(noc[ys[lost], xs[lost]] > nearest + 1) > 0.02 * len(y):  # beside it here, behind it there
+        return views
     noc[ys[lost], xs[lost]] = np.nan
     left[y, x + shift] = origin.left[y, x]
     right[yr, xr + shift] = origin.right[yr, xr]

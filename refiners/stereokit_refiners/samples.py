@@ -195,7 +195,7 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     options = dict(HALF.get(parse_method(method), {}))
     if number > 0:
         rng = np.random.default_rng([seed, number, int(pair.digest[:8], 16)])
-        if number % 2 == 0:
+        if number % 2 == 0 and np.isfinite(views.noc).any():
             views = mirrored(views)
         views = photographed(rng, rescaled(rng, moved_objects(rng, views)))
         options |= _drawn_options(rng, method)
@@ -273,7 +273,7 @@ def store_variant(pair: Pair, method: str, seed: int, number: int, max_disparity
 
 def _read(path: Path) -> Sample:
     try:
-        with np.load(path) as held:
+        with path.open("rb") as file, np.load(file) as held:
             return Sample(
                 held["coarse"],
                 held["confidence"],
@@ -282,7 +282,7 @@ def _read(path: Path) -> Sample:
                 held["seen"],
                 tuple(held["size"].tolist()),
             )
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
         raise FileError(f"cache must hold samples of this program, cannot read {str(path)!r} ({error})") from None
 
 

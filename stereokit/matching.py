@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Levels, Pair
-from stereokit.defaults import DEFAULTS, METHODS
+from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import (
     GrayPair,
@@ -128,6 +128,7 @@ class Matcher:
         if self.scale == 0.5:
             self.refiner, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
             self._refine = factory(**{k: options[k] for k in refiner_options if k in options})
+        self._needs_confidence = bool(getattr(self._refine, "needs_confidence", False))
         self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
         self._pool = Pool()
 
@@ -136,7 +137,7 @@ class Matcher:
         cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         cost_options, aggregation_options = option_names(cost), option_names(aggregation)
         check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options, *elsewhere}))
-        merged = {**DEFAULTS[""], **DEFAULTS.get(self.method, {}), **options}
+        merged = {**defaults_of(self.method, half=self.scale == 0.5), **options}
         self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
         if "p2" not in options and "p2" in merged:  # a default gives way to what the cost leaves of 8 bits
             merged["p2"] = min(merged["p2"], (255 - self.cost.cost_max) / self.cost.unit)
@@ -260,7 +261,8 @@ class Matcher:
             return self._match_levels(pair, self.min_disparity, self.max_disparity, workspace, threads)
         low, high = self.min_disparity // 2, -(-self.max_disparity // 2)
         coarse = self._match_levels(half_size(pair), low, max(high, low + 1), workspace, threads)
-        return self._refine(coarse, pair.guide, threads=threads)
+        refined = self._refine(coarse, pair.guide, threads=threads)
+        return refined if self.confidence else Disparity(refined.disparity, refined.valid)
 
     def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace, threads: int) -> Disparity:
         with crew(threads):
@@ -277,7 +279,7 @@ class Matcher:
         )
         disparity = workspace.array("match.disparity", shape, np.float32)
         cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
-        confidence = np.empty(shape, np.float32) if self.confidence else None
+        confidence = np.empty(shape, np.float32) if self.confidence or self._needs_confidence else None
         out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness)
         self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, threads, out)
         chain = Chain(self.smp, int(self.speckle * disparity.size), self.fill, self.median, low)

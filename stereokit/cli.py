@@ -162,7 +162,7 @@ def match(
     for name, path in outputs.items():
         io.check_output(path, suffixes[name], name)
         if name in ("--output", "--right") and path.suffix.lower() == ".png":
-            _check_fits_png(name, min_disparity, max_disparity)
+            commandline.check_fits_png(name, min_disparity, max_disparity)
     outputs.update(commandline.check_json(json_file))
     _check_distinct({"LEFT": left, "RIGHT": right_image, "--calibration": calibration}, outputs)
     if (ply is None) != (calibration is None):
@@ -326,12 +326,6 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _check_fits_png(name: str, min_disparity: int, max_disparity: int) -> None:
-    if min_disparity < 0 or max_disparity > 256:
-        span = f"{min_disparity} .. {max_disparity}"
-        raise OptionError(f"{name}: a KITTI .png holds disparities in 0 .. 256, got {span}; use .pfm or .npy")
 
 
 def _check_distinct(inputs: dict[str, Path | None], outputs: dict[str, Path]) -> None:

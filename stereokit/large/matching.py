@@ -1,0 +1,220 @@
+"""Match images that do not fit in memory: overlapping windows, one at a time, as large as a bound of memory allows.
+
+Semi-global costs reach across the whole image in theory, and the domain transform's filter fades but does not end;
+in practice both forget within some tens of pixels what came before. So a window is matched with a margin, `overlap`,
+that is then dropped; what remains differs from the map of the whole image in few pixels, the fewer the larger the
+margin is (`OVERLAP` has the figures). What is decided from whole images (the range of 16-bit and floating-point
+values, the largest region that counts as a speckle) is decided so here too; only filling looks no further than the
+window.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.costs import Zncc
+from stereokit.errors import InputError, OptionError
+from stereokit.inputs import GrayPair, check_integer
+from stereokit.kernels.workspace import Workspace
+from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes, window_model
+from stereokit.large.output import check_large_output, write_bands
+from stereokit.large.plan import Plan, plan
+from stereokit.large.sources import Source, open_source
+from stereokit.large.tones import BLOCK_NBYTES, Ranges, Tone, find_ranges, find_tone, read_pair
+from stereokit.matching import Matcher
+from stereokit.result import Disparity
+
+__all__ = ["OVERLAP", "LargeResult", "match_large"]
+
+OVERLAP = 64
+
+_RESERVE_NBYTES = 6 * BLOCK_NBYTES + 2**24
+"""For blocks on their way to grey, and what the interpreter and the system take meanwhile."""
+
+
+@dataclass(frozen=True)
+class LargeResult:
+    """What was written.
+
+    Attributes
+    ----------
+    output : Path
+        The map: float32, pixels, NaN where invalid.
+    height, width : int
+        Of the map.
+    window : tuple of int
+        Height and width of the windows that were matched.
+    windows : int
+        Their number.
+    overlap : int
+        The margin that was dropped at each cut side, pixels.
+    density : float
+        The share of pixels that were measured, from 0 to 1.
+    matcher : Matcher
+        The matcher with all its options.
+    """
+
+    output: Path
+    height: int
+    width: int
+    window: tuple[int, int]
+    windows: int
+    overlap: int
+    density: float
+    matcher: Matcher
+
+
+def match_large(
+    left: Any,
+    right: Any,
+    output: str | os.PathLike[str],
+    method: str = "zncc+sgm",
+    *,
+    memory: int | float | str | None = None,
+    overlap: int = OVERLAP,
+    progress: Callable[[int, int], object] | None = None,
+    **options: Any,
+) -> LargeResult:
+    """Match a rectified pair window by window and write the left view's disparity map as it grows.
+
+    Parameters
+    ----------
+    left, right : path or array
+        Images of one size and type, as `stereokit.match` takes them. ``.npy`` files are mapped and TIFF files decoded
+        tile by tile (``stereokit[large]``); other files are read whole, and count in `memory`.
+    output : path
+        ``.npy``, or ``.tiff`` in tiles of 256 (``stereokit[large]``). It appears when it is complete.
+    method : str
+        ``"cost+aggregation"`` or S1 to S4.
+    memory : int, str or None
+        Bound of what the whole process occupies, bytes or such as ``"2GB"``; None is what it occupies now and half
+        of what is free.
+    overlap : int
+        Margin around what is kept of a window, pixels; in the direction of disparity, as many more as there are
+        disparities.
+    progress : callable or None
+        Called with the number of windows done and of all.
+    **options
+        Those of `Matcher`, without ``right`` and ``confidence``.
+
+    Returns
+    -------
+    LargeResult
+
+    Raises
+    ------
+    InputError, OptionError, FileError
+        If an image, an option or the output cannot be used, or `memory` does not suffice for the smallest window.
+    StereokitError
+        If TIFF is read or written without tifffile.
+    """
+    target = check_large_output(output)
+    overlap = check_integer("overlap", overlap, 0, 2**20)
+    for name in ("right", "confidence"):
+        if options.get(name):
+            raise OptionError(f"{name} is not available when an image is matched in windows")
+    matcher = Matcher(method, **options)
+    limit = None if memory is None else parse_memory(memory)
+    sources = open_source("left", left), open_source("right", right)
+    _check_pair(*sources)
+    tone = find_tone(*sources)
+    height, width = sources[0].shape[:2]
+    windows = _plan(matcher, sources, tone, overlap, limit, target)
+    matcher_of_windows = _for_windows(matcher, height, width, windows.window)
+    ranges: Ranges | None = None
+    if isinstance(matcher.cost, Zncc):  # its grey levels depend on the range of the whole image
+        ranges = find_ranges(*sources, tone, matcher.scale != 1, matcher.smooth, matcher.threads)
+    measured = 0
+
+    def count(pixels: int) -> None:
+        nonlocal measured
+        measured += pixels
+
+    bands = _bands(matcher_of_windows, sources, tone, ranges, windows, count, progress)
+    write_bands(target, height, width, bands)
+    total = len(windows.rows) * len(windows.columns)
+    density = measured / (height * width)
+    return LargeResult(target, height, width, windows.window, total, overlap, density, matcher)
+
+
+def _check_pair(left: Source, right: Source) -> None:
+    if left.dtype != right.dtype:
+        raise InputError(f"left and right must have the same type, got {left.dtype} and {right.dtype}")
+    if left.shape[:2] != right.shape[:2]:
+        raise InputError(f"left and right must have the same size, got {left.shape[:2]} and {right.shape[:2]}")
+
+
+def _plan(
+    matcher: Matcher, sources: tuple[Source, Source], tone: Tone, overlap: int, limit: int | None, target: Path
+) -> Plan:
+    def match(pair: GrayPair, workspace: Workspace) -> Disparity:
+        return matcher.match_gray(pair, workspace, matcher.threads)
+
+    buffers = window_model(match, tone.kind)
+    height, width = sources[0].shape[:2]
+    size = tone.kind.itemsize
+    pixel = 2 * size + (size > 1) + 2 * (sources[0].dtype.kind == "f") + 5  # both images, guide, masks, the map
+    pixel += 4 * isinstance(matcher.cost, Zncc)  # the images once more
+    pixel += _refiner_nbytes(matcher)
+    band = 4 * width * (1 if target.suffix.lower() == ".npy" else 3)
+
+    def needed(rows: int, columns: int) -> float:
+        return buffers(rows, columns) + pixel * rows * columns + band * rows
+
+    used = resident_nbytes()
+    limit = used + free_nbytes() // 2 if limit is None else limit
+    left_over = limit - used - _RESERVE_NBYTES - max(source.piece_nbytes for source in sources)
+    reach_x = overlap + max(abs(matcher.min_disparity), abs(matcher.max_disparity))
+    return plan(height, width, overlap, reach_x, left_over, needed)
+
+
+def _refiner_nbytes(matcher: Matcher) -> int:
+    """Return the bytes a pixel that a refiner takes beside the matcher's buffers; measured, see the tests."""
+    if matcher.refiner is None:
+        return 0
+    return 12 if matcher.refiner == "linear" else 200
+
+
+def _for_windows(matcher: Matcher, height: int, width: int, window: tuple[int, int]) -> Matcher:
+    """Return a matcher for which the largest speckle has as many pixels as in the whole image."""
+    step = 1 if matcher.scale == 1 else 2
+    whole, part = (-(-h // step) * -(-w // step) for h, w in ((height, width), window))
+    changed = copy.copy(matcher)
+    if matcher.speckle:
+        changed.speckle = (int(matcher.speckle * whole) + 0.5) / part
+    return changed
+
+
+def _bands(
+    matcher: Matcher, sources: tuple[Source, Source], tone: Tone, ranges: Ranges | None,
+    windows: Plan, count: Callable[[int], None], progress: Callable[[int, int], object] | None,
+) -> Iterator[NDArray[np.float32]]:  # fmt: skip
+    """Yield the map in bands of full width."""
+    workspace = Workspace()
+    width = sources[0].shape[1]
+    total, done = len(windows.rows) * len(windows.columns), 0
+    for row in windows.rows:
+        band = np.empty((row.last - row.first, width), np.float32)
+        for column in windows.columns:
+            pair = read_pair(*sources, tone, (row.start, row.stop, column.start, column.stop), ranges)
+            found = matcher.match_gray(pair, workspace, matcher.threads)
+            kept = (
+                slice(row.first - row.start, row.last - row.start),
+                slice(column.first - column.start, column.last - column.start),
+            )
+            band[:, column.first : column.last] = found.disparity[kept]
+            count(int(np.count_nonzero(found.valid[kept])))
+            del pair, found  # before the next window is read
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        yield band
+        del band

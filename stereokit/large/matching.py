@@ -121,7 +121,7 @@ def match_large(
     progress : callable or None
         Called with the number of windows done and of all.
     **options
-        Those of `Matcher`, without ``right`` and ``confidence``.
+        Those of `Matcher`, but ``right`` and ``confidence``.
 
     Returns
     -------
@@ -136,9 +136,8 @@ def match_large(
     """
     target = check_large_output(output)
     overlap = check_integer("overlap", overlap, 0, 2**20)
-    for name in ("right", "confidence"):
-        if options.get(name):
-            raise OptionError(f"{name} is not available when an image is matched in windows")
+    if options.get("confidence"):
+        raise OptionError("confidence is not available when an image is matched in windows")
     matcher = Matcher(method, **options)
     limit = None if memory is None else parse_memory(memory)
     sources = open_source("left", left), open_source("right", right)

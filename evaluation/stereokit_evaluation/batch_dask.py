@@ -89,7 +89,8 @@ def on_cluster(job: Job, pairs: Iterable[Pair | FramePair], client: Any) -> Gene
                 time.sleep(_LOOK_S / 5 if more else 0)
                 continue
             try:
-                done = wait(list(waiting), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
+                with client.as_current():
+                    done = wait(list(waiting), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 continue
             for future in done:

@@ -21,7 +21,7 @@ import numpy as np
 import stereokit
 from stereokit.errors import StereokitError
 from stereokit.kernels.pool import available_threads
-from stereokit_evaluation.batch_store import held
+from stereokit_evaluation.batch_store import finished, held
 from stereokit_evaluation.batch_work import Job, Outcome, matcher_of, work
 from stereokit_evaluation.pairs import Pair
 from stereokit_evaluation.video_pairs import FramePair, Video
@@ -171,6 +171,9 @@ def run_batch(
             summary.stopped = str(error)
         finally:
             outcomes.close()
+        if summary.interrupted or summary.stopped:  # some were finished that nobody asked for any more
+            now = sum(map(owned, finished(Path(job.folder), job.suffix)))
+            summary.written = max(summary.written, now - summary.found)
     summary.seconds = time.perf_counter() - start
     return summary
 

@@ -35,6 +35,8 @@ _FOLDERS = (
     *((f"{top}colored_0", f"{top}colored_1") for top in ("", "training/", "testing/")),
     ("image_02/data", "image_03/data"),
 )
+_PART = r"""[^./\x00-\x1f\\:*?"<>|][^/\x00-\x1f\\:*?"<>|]*"""
+_NAME = re.compile(f"{_PART}(?:/{_PART})*")
 _SIDES = (
     re.compile(r"(?P<name>.*)[-_.](?P<side>left|right|l|r)", re.IGNORECASE),
     re.compile(r"(?P<side>left|right)[-_.](?P<name>.*)", re.IGNORECASE),
@@ -135,14 +137,15 @@ def list_pairs(path: Path) -> list[Pair]:
 
 
 def _cells(text: str) -> Sequence[str]:
-    if "," in text:
+    if '"' in text and "," in text:
         return next(csv.reader([text], skipinitialspace=True))
+    if "," in text:
+        return text.split(",")
     return text.split("\t") if "\t" in text else text.split()
 
 
 def _bad_name(name: str) -> bool:
-    parts = name.split("/")
-    return any(not part or part.startswith(".") or re.search(r'[\x00-\x1f\\:*?"<>|]', part) for part in parts)
+    return _NAME.fullmatch(name) is None
 
 
 def _halves(pattern: str) -> list[str]:

@@ -183,18 +183,17 @@ def on_threads(
 ) -> Generator[Outcome, None, None]:
     """Work on pairs with threads of this process, one pair each; all processors by default."""
     count = available_threads() if workers is None else workers
-    small = np.zeros((32, 32), np.uint8)
-    matcher_of(job)(small, small)  # compiles, once
     waiting: set[Future[Outcome]] = set()
     source = iter(pairs)
     with ThreadPoolExecutor(count, thread_name_prefix="stereokit-batch") as executor:
         try:
-            more = True
+            more, compiled = True, False
             while more or waiting:
                 while more and len(waiting) < 2 * count:
                     pair = next(source, None)
                     more = pair is not None
                     if pair is not None:
+                        compiled = compiled or _compile(job)
                         waiting.add(executor.submit(_outcome, job, pair))
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -202,6 +201,13 @@ def on_threads(
         finally:
             for future in waiting:
                 future.cancel()
+
+
+def _compile(job: Job) -> bool:
+    """Match a small pair, so that threads do not compile side by side."""
+    small = np.zeros((32, 32), np.uint8)
+    matcher_of(job)(small, small)
+    return True
 
 
 def _outcome(job: Job, pair: Pair | FramePair) -> Outcome:

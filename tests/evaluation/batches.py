@@ -68,7 +68,7 @@ def environment():
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
-def wait_for(condition, process=None, seconds=120):
+def wait_for(condition, process=None, seconds=300):
     """Wait until `condition` holds; fail if the process ends before, or it takes too long."""
     end = time.monotonic() + seconds
     while not condition():

@@ -127,9 +127,9 @@ def test_what_is_no_input_is_refused(tmp_path):
 def test_a_hundred_thousand_pairs_are_listed_in_seconds(tmp_path):
     lines = "".join(f"left/{k:06d}.png,right/{k:06d}.png\n" for k in range(100_000))
     (tmp_path / "list.csv").write_text(lines, encoding="utf-8")
-    start_s = time.perf_counter()
+    begun = time.process_time()
     pairs = list_pairs(tmp_path / "list.csv")
-    assert len(pairs) == 100_000 and time.perf_counter() - start_s < 10
+    assert len(pairs) == 100_000 and time.process_time() - begun < 3
 
 
 # What is written
@@ -333,7 +333,7 @@ def test_an_interrupted_run_says_so_and_goes_on(tmp_path):
     process = start(tmp_path, "-o", out, folder=tmp_path)
     wait_for(lambda: len(inodes(out)) >= 3, process)
     process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 130
+    assert process.wait(300) == 130
     assert "the same command goes on" in (tmp_path / "stderr").read_text()
     summary = json.loads((out / "summary.json").read_text())
     assert summary["interrupted"] and summary["written"] == len(inodes(out)) < 120

@@ -249,14 +249,15 @@ class Matcher:
     def _call(self, left: Any, right: Any, threads: int) -> Disparity:
         pair = gray_pair(left, right)
         with self._pool.take() as workspace:
-            full = self._match(pair, workspace, threads)
+            full = self.match_gray(pair, workspace, threads)
             if not self.right:
                 return full
-            mirrored = self._match(_mirror(pair), workspace, threads)
+            mirrored = self.match_gray(_mirror(pair), workspace, threads)
         other = np.ascontiguousarray(mirrored.disparity[:, ::-1])
         return Disparity(full.disparity, full.valid, full.confidence, other)
 
-    def _match(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
+    def match_gray(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
+        """Match a pair that was checked and is grey, with buffers of the caller; no right view's map."""
         if self._refine is None:
             return self._match_levels(pair, self.min_disparity, self.max_disparity, workspace, threads)
         low, high = self.min_disparity // 2, -(-self.max_disparity // 2)
@@ -273,7 +274,7 @@ class Matcher:
         pair = smooth(pair, self.smooth, workspace, threads)
         shape = pair.left.shape
         rows = self.cost.prepare(
-            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads),
+            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads, pair.ranges),
             workspace,
             max(2, threads),
         )
@@ -297,7 +298,8 @@ def _mirror(pair: GrayPair) -> GrayPair:
 
     left, right = flip(pair.right), flip(pair.left)
     assert left is not None and right is not None
-    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right))
+    ranges = None if pair.ranges is None else (pair.ranges[1], pair.ranges[0])
+    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges)
 
 
 _matchers: dict[Any, Matcher] = {}

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import pkgutil
+import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 import drawing
+from sphinx.util import logging
 
 import stereokit
 
@@ -21,10 +24,10 @@ author = "The stereokit developers"
 copyright = author
 release = version = stereokit.__version__
 
-extensions = ["myst_parser", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
+extensions = ["myst_parser", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "_generated"]
 default_role = "py:obj"  # `Matcher` in a docstring is a link if there is such a thing, else code
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
@@ -41,6 +44,24 @@ html_copy_source = False
 html_show_copyright = False
 
 
+def resolve(app: Any, env: Any, node: Any, content: Any) -> Any:
+    """Find what a docstring calls by another path than that of its definition, such as `stereokit_refiners.Refiner`.
+
+    A path within the project that leads nowhere is a mistake in the docstring, and reported.
+    """
+    target = node.get("reftarget", "")
+    if node.get("refdomain") != "py" or not re.match(r"stereokit\w*\.", target):
+        return None
+    try:
+        found = pkgutil.resolve_name(target)
+    except (ImportError, AttributeError):
+        logging.getLogger("conf").warning("nothing is called %s", target, location=node)
+        return None
+    path = f"{getattr(found, '__module__', None)}.{getattr(found, '__qualname__', None)}"
+    return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", path, node, content)
+
+
 def setup(app: Any) -> None:
     """Draw the pictures and write the commands' help before the pages are read."""
+    app.connect("missing-reference", resolve)
     app.connect("builder-inited", lambda app: drawing.write_all(Path(app.srcdir) / "_generated"))

@@ -61,7 +61,7 @@ def write_all(folder: Path) -> None:
     write_bytes(folder / "tradeoff.svg", readme_tables.tradeoff(measured))
     street = Street()
     rows = [street.panel(name, street.match(name)) for name in ("S1", "S2", "S3", "S4")]
-    rows += [street.panel(f"{m} at half size, refined", refined(street, m)) for m in ("S2", "S4")]
+    rows += [street.panel(f"{m}/2+stereokit: half size, refined", refined(street, m)) for m in ("S2", "S4")]
     write_bytes(folder / "methods.jpg", jpeg(street.sheet(rows)))
     tuned = [street.panel(f"P2={p2}", street.match("S2", p1=min(15, p2), p2=p2)) for p2 in (5, 85, 200)]
     write_bytes(folder / "penalties.jpg", jpeg(street.sheet(tuned)))

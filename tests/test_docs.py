@@ -36,7 +36,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", CARD, *sorted((ROOT / "do
 RUN = ("export", "info", "list", "match", "view")
 EXTRAS = {"export": ("onnx", "onnxruntime"), "--refiner": ("openvino",), "view": ("jinja2",)}
 SHELL, OTHER = ("", "shell"), ("text", "toml")
-FENCE = re.compile(r"(?:^<!-- not run: (?P<reason>.+) -->\n)?^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.M | re.S)
+FENCE = re.compile(r"(?:^<!-- not run: (?P<reason>.+) -->\n)?^```(?P<language>.*)\n(?P<code>(?s:.*?))^```$", re.M)
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    found = FENCE.finditer(page.read_text(encoding="utf-8"))
-    return [Block(block["language"], block["code"], block["reason"]) for block in found]
+    found = [Block(*block.group("language", "code", "reason")) for block in FENCE.finditer(page.read_text("utf-8"))]
+    return [block for block in found if not block.language.startswith("{")]  # those are directives of the site
 
 
 def commands(code: str) -> list[list[str]]:

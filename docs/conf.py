@@ -45,20 +45,26 @@ html_show_copyright = False
 
 
 def resolve(app: Any, env: Any, node: Any, content: Any) -> Any:
-    """Find what a docstring calls by another path than that of its definition, such as `stereokit_refiners.Refiner`.
+    """Find what a docstring calls by another path than its page does, such as `stereokit_refiners.Refiner`.
 
     A path within the project that leads nowhere is a mistake in the docstring, and reported.
     """
-    target = node.get("reftarget", "")
-    if node.get("refdomain") != "py" or not re.match(r"stereokit\w*\.", target):
+    target, module = node.get("reftarget", ""), node.get("py:module")
+    if node.get("refdomain") != "py" or not re.fullmatch(r"\w[\w.]*", target):
         return None
-    try:
-        found = pkgutil.resolve_name(target)
-    except (ImportError, AttributeError):
+    domain = env.domains["py"]
+    for path in (target, f"{module}.{target}"):
+        try:
+            found = pkgutil.resolve_name(path)
+        except (ImportError, AttributeError, ValueError):
+            continue
+        for name in domain.objects:
+            if name.split(".")[-1] == getattr(found, "__name__", "") and pkgutil.resolve_name(name) is found:
+                return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", name, node, content)
+        return None
+    if re.match(r"stereokit\w*\.", target):
         logging.getLogger("conf").warning("nothing is called %s", target, location=node)
-        return None
-    path = f"{getattr(found, '__module__', None)}.{getattr(found, '__qualname__', None)}"
-    return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", path, node, content)
+    return None
 
 
 def setup(app: Any) -> None:

@@ -165,6 +165,24 @@ def parse(words: list[str], line: str) -> None:
         parse_method(method)
 
 
+def test_the_figures_of_the_pages_are_those_of_the_readme(monkeypatch, tmp_path):
+    pytest.importorskip("matplotlib")
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    from readme_tables import find, tradeoff
+
+    measured = find(ROOT / "README.md", "MB added")
+    assert measured.number("OpenCV 5 SGBM, 3WAY", "validation") is None
+    assert b"<svg" in tradeoff(measured)
+    assert find(ROOT / "README.md", "ms of S4, 1 / 2 threads").text.startswith("| KITTI 2015")
+    page = tmp_path / "page.md"
+    page.write_text("| a | b |\n|---|---|\n| x | **1.5 %**, 7 |\n| y | |\n\nHow it was\nmeasured.\n\nMore.\n")
+    table = find(page, "b")
+    assert (table.number("x", "b", 0), table.number("x", "b"), table.number("y", "b")) == (1.5, 7, None)
+    assert table.text.endswith("| y | |\n\nHow it was\nmeasured.")
+    with pytest.raises(LookupError, match=r"page.md must have one table with a column 'c', got 0"):
+        find(page, "c")
+
+
 class Parsed(Exception):
     """A module's arguments were parsed."""
 

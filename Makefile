@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types check clean
+.PHONY: demo docs test lint types check clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -22,6 +22,10 @@ demo: $(VENV)/.user  ## match a synthetic street with S1 to S4: pictures in demo
 test: $(VENV)/.dev  ## all tests
 	$(BIN)/python -m pytest
 
+docs: $(VENV)/.dev  ## the documentation, in docs/_build/html; warnings are errors
+	NUMBA_CACHE_DIR=$(CURDIR)/.numba_cache $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
 lint: $(VENV)/.dev  ## style and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -30,7 +34,7 @@ lint: $(VENV)/.dev  ## style and the direction of imports
 types: $(VENV)/.dev  ## the strict type checker
 	$(BIN)/mypy
 
-check: lint types test  ## what CI runs
+check: lint types test docs  ## what CI runs
 
 clean:  ## remove what the tasks made
-	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache build dist demo study
+	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache build dist demo study docs/_build docs/_generated

@@ -78,14 +78,14 @@ class Matcher:
     fill : {"background", "nearest"} or None
         How invalid pixels are filled; None (or ``"none"``) leaves them NaN.
     **options
-        Options of the stages by name: those of the cost and of the aggregation (see `stereokit.costs.Census`,
-        `Zncc`, `stereokit.aggregation.Sgm`, `Dt`) and of the refiner, ``subpixel``, and of the pipeline: ``smooth``
-        (sigma in pixels of a Gaussian on both images before matching), ``uniqueness`` (percent by which the best
-        rival must cost more, or the pixel is invalid), ``smp`` (bool, single matching phase), ``speckle`` (largest
-        region of like disparity that is removed, as a share of the image), ``median`` (0, 3 or 5), ``outside``
-        (cost of matches outside the right image as a share of the cost's range, or None for the nearest border
-        pixel), ``confidence`` (bool) and ``right`` (bool, the
-        right view's map too; twice the time). Defaults are those of `stereokit.defaults`.
+        Options of the stages by name: those of the cost and of the aggregation (see `stereokit.Census`,
+        `stereokit.Zncc`, `stereokit.aggregation.sgm.Sgm`, `stereokit.aggregation.dt.Dt`) and of the refiner,
+        ``subpixel``, and of the pipeline: ``smooth`` (sigma in pixels of a Gaussian on both images before matching),
+        ``uniqueness`` (percent by which the best rival must cost more, or the pixel is invalid), ``smp`` (bool,
+        single matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the
+        image), ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of the cost's
+        range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the right view's map
+        too; twice the time). Defaults are those of `stereokit.defaults`.
 
     Raises
     ------

@@ -1,10 +1,14 @@
 """Median filter of a disparity map, border replicated, NaN left out.
 
 Dense maps go to OpenCV; where pixels are invalid, the median is over the valid ones of the window (the lower of
-the two middle ones if they are even in number) and an invalid pixel stays invalid.
+the two middle ones if they are even in number) and an invalid pixel stays invalid. There the windows of 64 neighbours
+are sorted side by side by Batcher's network (Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M), invalid
+values last, which needs no branch; the number of valid ones tells where the median then is.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -12,6 +16,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, OptionError
 from stereokit.kernels.jit import kernel
+from stereokit.kernels.simd import LANES, load, maximum, minimum, store
 from stereokit.kernels.workspace import Workspace
 
 __all__ = ["median", "median_rows"]
@@ -58,8 +63,17 @@ def median_rows(
     half = size // 2
     top, bottom = max(y0 - half, 0), min(y1 + half, source.shape[0])
     part = source[top:bottom]
-    if not dense and np.isnan(part).any():
-        _median_of_valid(source, half, y0, y1, np.empty(size * size, np.float32), out)
+    if not dense and (gaps := np.isnan(part)).any():
+        window, border = (size, size), cv2.BORDER_REPLICATE
+        known = np.asarray(
+            cv2.boxFilter((~gaps).view(np.uint8), -1, window, normalize=False, borderType=border), np.uint8
+        )
+        wide = np.asarray(cv2.copyMakeBorder(part, half, half, half, half + LANES, border), np.float32)
+        wide[np.isnan(wide)] = np.inf
+        room = np.empty(size * size * LANES, np.float32)
+        network = _network(size * size)
+        _median_of_valid(wide.ravel(), size, part.shape[1], y0 - top, known[y0 - top :], network, room, out[y0:y1])
+        out[y0:y1][gaps[y0 - top : y1 - top]] = np.nan
     elif top == y0 and bottom == y1:
         cv2.medianBlur(part, size, dst=out[y0:y1])
     else:
@@ -68,25 +82,36 @@ def median_rows(
         out[y0:y1] = held[y0 - top : y1 - top]
 
 
+@lru_cache(maxsize=2)
+def _network(count: int) -> NDArray[np.int64]:
+    """Return the comparisons that sort `count` values, (N, 2): each puts the smaller one first."""
+    pairs = []
+    top = 1 << ((count - 1).bit_length() - 1)
+    p = top
+    while p > 0:
+        q, r, d = top, 0, p
+        while d > 0:
+            pairs += [(i, i + d) for i in range(count - d) if i & p == r]
+            d, q, r = q - p, q >> 1, p
+        p >>= 1
+    return np.array(pairs, np.int64)
+
+
 @kernel
 def _median_of_valid(
-    source: NDArray[np.float32], half: int, y0: int, y1: int, held: NDArray[np.float32], out: NDArray[np.float32]
-) -> None:
-    height, width = source.shape
-    for y in range(y0, y1):
-        for x in range(width):
-            if np.isnan(source[y, x]):
-                out[y, x] = np.nan
-                continue
-            count = 0
-            for dy in range(-half, half + 1):
-                for dx in range(-half, half + 1):
-                    value = source[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)]
-                    if not np.isnan(value):
-                        place = count  # insertion sort: at most 25 values
-                        while place > 0 and held[place - 1] > value:
-                            held[place] = held[place - 1]
-                            place -= 1
-                        held[place] = value
-                        count += 1
-            out[y, x] = held[(count - 1) // 2]
+    wide: NDArray[np.float32], size: int, width: int, y0: int, known: NDArray[np.uint8], pairs: NDArray[np.int64],
+    held: NDArray[np.float32], out: NDArray[np.float32],
+) -> None:  # fmt: skip
+    stride = width + size - 1 + LANES
+    for y in range(out.shape[0]):
+        for x0 in range(0, width, LANES):
+            for k in range(size * size):
+                store(held, k * LANES, load(wide, (y0 + y + k // size) * stride + x0 + k % size))
+            for n in range(len(pairs)):
+                first, second = pairs[n, 0] * LANES, pairs[n, 1] * LANES
+                a, b = load(held, first), load(held, second)
+                store(held, first, minimum(a, b))
+                store(held, second, maximum(a, b))
+            for x in range(x0, min(x0 + LANES, width)):
+                middle = (np.int64(known[y, x]) - 1) // 2
+                out[y, x] = held[max(middle, 0) * LANES + x - x0]

@@ -8,6 +8,7 @@ import pytest
 
 from stereokit import InputError, OptionError, UnknownNameError
 from stereokit.postprocess import fill, median, remove_speckles, single_matching_phase
+from stereokit.postprocess.median import _network, median_rows
 
 NAN = np.nan
 SHAPES = [(9, 14), (1, 12), (12, 1), (1, 1), (2, 3)]
@@ -94,6 +95,24 @@ def test_median_leaves_gaps_out():
     out = median(disparity, 3)
     assert out[1, 1] == 2  # of 1, 2, 5, 9 the lower of the two middle ones
     np.testing.assert_array_equal(np.isnan(out), np.isnan(disparity))
+
+
+@pytest.mark.parametrize("count", [9, 25])
+def test_the_network_of_the_median_sorts(count):
+    values = np.random.default_rng(0).integers(0, 2, (count, 20_000))  # what sorts zeros and ones sorts everything
+    values[:, : count + 1] = np.tri(count, count + 1, -1)
+    expected = np.sort(values, axis=0)
+    for a, b in _network(count):
+        values[a], values[b] = np.minimum(values[a], values[b]), np.maximum(values[a], values[b])
+    np.testing.assert_array_equal(values, expected)
+
+
+def test_the_median_of_a_map_with_gaps_is_the_same_in_bands():
+    disparity = map_of((40, 150), 6, 0.3)
+    out = np.empty_like(disparity)
+    for y0, y1 in ((0, 1), (1, 17), (17, 40)):
+        median_rows(disparity, 5, y0, y1, out)
+    np.testing.assert_array_equal(out, median(disparity, 5))
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -57,9 +57,10 @@ def single_matching_phase(
 def right_column(x: int, d: np.float32, width: int) -> int:
     """Return the right column that left column `x` matches, or -1 if none: outside the image, or `d` is NaN."""
     at = np.float32(x) - d + np.float32(0.5)
-    if not (at >= np.float32(0) and at < np.float32(width)):  # NaN is neither
-        return np.int64(-1)
-    return np.int64(np.int32(at))
+    column: int = np.int64(-1)
+    if at >= np.float32(0) and at < np.float32(width):  # NaN is neither
+        column = np.int64(np.int32(at))
+    return column
 
 
 @kernel

@@ -72,7 +72,8 @@ def remove_speckles(
 @inline
 def alike(a: np.float32, b: np.float32, limit: np.float32) -> bool:
     """Whether neighbours with these disparities belong to one region; a NaN belongs to none."""
-    return abs(a - b) <= limit
+    near: bool = abs(a - b) <= limit
+    return near
 
 
 @inline

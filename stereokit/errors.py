@@ -9,7 +9,15 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["DeviceError", "FileError", "InputError", "OptionError", "StereokitError", "UnknownNameError", "did_you_mean"]
+__all__ = [
+    "DeviceError",
+    "FileError",
+    "InputError",
+    "OptionError",
+    "StereokitError",
+    "UnknownNameError",
+    "did_you_mean",
+]
 
 
 class StereokitError(ValueError):

@@ -31,9 +31,9 @@ from stereokit.kernels.cuda import (
     u64,
 )
 
-__all__ = ["blocks_for", "clamped", "gaussian_weights", "halve", "ranges", "smooth", "take", "take_kernel"]
+__all__ = ["KINDS", "blocks_for", "clamped", "gaussian_weights", "halve", "ranges", "smooth", "take", "take_kernel"]
 
-_KINDS = {np.dtype(np.uint8): u8, np.dtype(np.uint16): u16}
+KINDS = {np.dtype(np.uint8): u8, np.dtype(np.uint16): u16}
 
 
 def blocks_for(threads: int, block: int) -> int:
@@ -50,7 +50,7 @@ def clamped(value, last):  # type: ignore[no-untyped-def]
 @cache
 def take_kernel(dtype: np.dtype[Any]) -> Kernel:
     """Return the kernel that copies an image, grey or RGB, into its place, mirrored if asked for."""
-    kind = _KINDS[dtype]
+    kind = KINDS[dtype]
 
     @kernel(array(kind), array(kind), i32, i32, i32, i32, i32, block=128, name=f"take_{dtype}")
     def take(image, out, place, channels, mirrored, height, width):  # type: ignore[no-untyped-def]
@@ -79,7 +79,7 @@ def take_kernel(dtype: np.dtype[Any]) -> Kernel:
 @cache
 def halve_kernel(dtype: np.dtype[Any]) -> Kernel:
     """Return the kernel that averages 2x2 pixels of `count` images."""
-    kind = _KINDS[dtype]
+    kind = KINDS[dtype]
 
     @kernel(array(kind), array(kind), i32, i32, i32, i32, block=128, name=f"halve_{dtype}")
     def halve(images, out, count, height, width, largest):  # type: ignore[no-untyped-def]
@@ -107,7 +107,7 @@ def halve_kernel(dtype: np.dtype[Any]) -> Kernel:
 @cache
 def blur_rows_kernel(dtype: np.dtype[Any]) -> Kernel:
     """Return the kernel that blurs `rows` rows; 8-bit pixels count 256 times."""
-    kind = _KINDS[dtype]
+    kind = KINDS[dtype]
     times = 256 if dtype == np.uint8 else 1
 
     @kernel(array(kind), array(u32), i32, array(u32), i32, i32, block=128, name=f"blur_rows_{dtype}")
@@ -145,7 +145,7 @@ def blur_columns(rows, weights, half, out, count, height, width):  # type: ignor
 @cache
 def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
     """Return the kernel that finds the smallest and the largest pixel of each image; one block for each."""
-    kind = _KINDS[dtype]
+    kind = KINDS[dtype]
     threads = 256
 
     @kernel(array(kind), array(i32), i32, block=threads, name=f"ranges_{dtype}")
@@ -178,7 +178,7 @@ def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
     return made
 
 
-for _dtype in _KINDS:
+for _dtype in KINDS:
     take_kernel(_dtype)
     halve_kernel(_dtype)
     blur_rows_kernel(_dtype)

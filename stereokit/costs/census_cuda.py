@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from stereokit.costs.census import WINDOWS, Census
-from stereokit.costs.rows_cuda import Scene, held
+from stereokit.costs.rows_cuda import EVIDENCE, Scene, held, masked_cost, padding
 from stereokit.inputs_cuda import KINDS, blocks_for, clamped
-from stereokit.kernels.cuda import Kernel, Queue, array, cuda, i32, kernel, u8, u32
+from stereokit.kernels.cuda import Kernel, Queue, array, cuda, i32, kernel, u32
 
 __all__ = ["bits_kernel", "costs_kernel", "volume"]
 
@@ -65,13 +65,13 @@ def bits_kernel(window: str, dtype: np.dtype[Any]) -> Kernel:
 
 
 @cache
-def costs_kernel(words: int) -> Kernel:
+def costs_kernel(words: int, masked: bool) -> Kernel:
     """Return the kernel that writes the volume of costs from bits of so many words."""
-    cells = array(u8), i32, i32, i32, i32, i32, i32, i32, i32
+    name = f"census_costs_{words}" + "_masked" * masked
 
-    @kernel(array(u32), array(u32), array(u32), *cells, block=128, name=f"census_costs_{words}")
+    @kernel(array(u32), array(u32), array(u32), *EVIDENCE, block=128, name=name)
     def census_costs(  # type: ignore[no-untyped-def]
-        left, right, volume, bad, masked, height, width, span, count, minimum, outside, beyond
+        left, right, volume, bad, height, width, span, count, minimum, outside, beyond
     ):
         at = u32(cuda.grid(1))
         strips = u32(u32(width + STRIP - 1) // u32(STRIP))
@@ -84,6 +84,7 @@ def costs_kernel(words: int) -> Kernel:
             level = i32(u32(4) * word)
             u = u32(u32(u32(y) * reach + u32(x0)) + u32(4 * span - 1 - level))
             pixel = u32(u32(u32(y) * u32(width)) + u32(x0))
+            pads = padding(level, count)
             near = cuda.local.array(4, u32)
             far = cuda.local.array(4, u32)
             for k in range(1, 4):  # of the pixel before, which level k - 1 of that one was
@@ -101,14 +102,15 @@ def costs_kernel(words: int) -> Kernel:
                         far[3 - k] = far[2 - k]
                     far[0] = right[u32(u32(u32(height) * reach) + u)]
                     also = left[u32(u32(u32(height) * u32(width)) + pixel)]
-                packed = u32(0)
+                packed = pads
                 for k in range(4):
                     cost = i32(cuda.popc(u32(mine ^ near[k])))
                     if words == 2:
                         cost = i32(cost + i32(cuda.popc(u32(also ^ far[k]))))
-                    cost = held(
-                        cost, i32(level + i32(k)), y, i32(x), bad, masked, height, width, count, minimum, outside, beyond
-                    )
+                    column = i32(i32(x) - level - i32(k) - minimum)
+                    cost = held(cost, column, width, outside, beyond)
+                    if masked:
+                        cost = masked_cost(cost, column, y, x, bad, height, width, outside)
                     packed = u32(packed | u32(u32(cost) << u32(8 * k)))
                 volume[u32(u32(pixel * u32(span)) + word)] = packed
                 pixel = u32(pixel + u32(1))
@@ -121,7 +123,8 @@ def costs_kernel(words: int) -> Kernel:
 for _window in WINDOWS:
     for _dtype in KINDS:
         bits_kernel(_window, _dtype)
-    costs_kernel(_words(_window))
+    costs_kernel(_words(_window), False)
+    costs_kernel(_words(_window), True)
 
 
 def volume(queue: Queue, cost: Census, scene: Scene) -> Any:
@@ -135,7 +138,7 @@ def volume(queue: Queue, cost: Census, scene: Scene) -> Any:
         blocks = blocks_for(height * columns, made.block)
         queue.launch(made, blocks, scene.images, place, start, columns, height, width, out)
     out = queue.array("costs", height * width * scene.padded // 4, np.uint32)
-    costs = costs_kernel(words)
+    costs = costs_kernel(words, scene.masked)
     threads = height * -(-width // STRIP) * scene.padded // 4
     queue.launch(costs, blocks_for(threads, costs.block), left, right, out, *scene.evidence(cost.cost_max))
     return out

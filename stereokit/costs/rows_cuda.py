@@ -15,9 +15,9 @@ from typing import Any
 
 from stereokit.costs.rows import Levels
 from stereokit.inputs_cuda import clamped
-from stereokit.kernels.cuda import device, i32, u32
+from stereokit.kernels.cuda import array, device, i32, u8, u32
 
-__all__ = ["Scene", "held", "pad_levels"]
+__all__ = ["EVIDENCE", "Scene", "held", "masked_cost", "pad_levels", "padding"]
 
 
 def pad_levels(count: int) -> int:
@@ -70,24 +70,34 @@ class Scene:
         return self.width + self.padded - 1
 
     def evidence(self, cost_max: int) -> tuple[Any, ...]:
-        """Return the last arguments of a cost's kernel."""
+        """Return the last arguments of a cost's kernel, of the types `EVIDENCE`."""
         outside = cost_max if self.outside is None else round(self.outside * cost_max)
         beyond = int(self.outside is None)
         size = self.height, self.width, self.padded // 4
-        return self.bad, int(self.masked), *size, self.levels.count, self.levels.minimum, outside, beyond
+        return self.bad, *size, self.levels.count, self.levels.minimum, outside, beyond
+
+
+EVIDENCE = (array(u8), i32, i32, i32, i32, i32, i32, i32)
+"""Types of `bad`, height, width, words of a pixel, levels, lowest disparity, cost without evidence and `beyond`."""
 
 
 @device
-def held(cost, level, y, x, bad, masked, height, width, count, minimum, outside, beyond):  # type: ignore[no-untyped-def]
-    """Return the cost of a cell, or what it is where there is no evidence."""
-    column = i32(x - level - minimum)
-    out = i32(cost)
-    if beyond == 0 and (column < 0 or column >= width):
-        out = i32(outside)
-    if masked != 0:
-        right = u32(u32(height + y) * u32(width) + u32(clamped(column, width - 1)))
-        if bad[u32(u32(y) * u32(width) + u32(x))] != 0 or bad[right] != 0:
-            out = i32(outside)
-    if level >= count:
-        out = i32(255)
-    return out
+def padding(level, count):  # type: ignore[no-untyped-def]
+    """Return what the padding levels of the word that begins with `level` hold: 255 each."""
+    existing = i32(min(max(i32(count - level), i32(0)), i32(4)))
+    return u32(0) if existing == 4 else u32(u32(0xFFFFFFFF) << u32(u32(8) * u32(existing)))
+
+
+@device
+def held(cost, column, width, outside, beyond):  # type: ignore[no-untyped-def]
+    """Return the cost of a cell whose right pixel lies in `column`, or what it is outside the image."""
+    return i32(cost) if beyond != 0 or u32(column) < u32(width) else i32(outside)
+
+
+@device
+def masked_cost(cost, column, y, x, bad, height, width, outside):  # type: ignore[no-untyped-def]
+    """Return the cost of a cell, or what it is where one of its two pixels is bad."""
+    right = u32(u32(height + y) * u32(width) + u32(clamped(column, width - 1)))
+    if bad[u32(u32(y) * u32(width) + u32(x))] != 0 or bad[right] != 0:
+        return i32(outside)
+    return i32(cost)

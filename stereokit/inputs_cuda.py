@@ -22,6 +22,7 @@ from stereokit.kernels.cuda import (
     array,
     cuda,
     device,
+    f32,
     i32,
     kernel,
     shuffle_xor,
@@ -31,7 +32,18 @@ from stereokit.kernels.cuda import (
     u64,
 )
 
-__all__ = ["KINDS", "blocks_for", "clamped", "gaussian_weights", "halve", "ranges", "smooth", "take", "take_kernel"]
+__all__ = [
+    "KINDS",
+    "blocks_for",
+    "clamped",
+    "flip",
+    "gaussian_weights",
+    "halve",
+    "ranges",
+    "smooth",
+    "take",
+    "take_kernel",
+]
 
 KINDS = {np.dtype(np.uint8): u8, np.dtype(np.uint16): u16}
 
@@ -176,6 +188,15 @@ def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
 
     made: Kernel = ranges
     return made
+
+
+@kernel(array(f32), array(f32), i32, i32, block=128)
+def flip(image, out, height, width):  # type: ignore[no-untyped-def]
+    """Mirror a map."""
+    at = u32(cuda.grid(1))
+    if at < u32(u32(height) * u32(width)):
+        x = u32(at % u32(width))
+        out[u32(u32(at - x) + u32(u32(width) - u32(1) - x))] = image[at]
 
 
 for _dtype in KINDS:

@@ -21,7 +21,7 @@ from stereokit.errors import DeviceError
 from stereokit.inputs_cuda import KINDS, blocks_for, clamped, ranges
 from stereokit.kernels.cuda import Kernel, Queue, array, cuda, f32, i16, i32, kernel, u32
 
-__all__ = ["LARGEST_WINDOW", "centre_kernel", "costs_kernel", "statistics", "volume"]
+__all__ = ["LARGEST_WINDOW", "centre_kernel", "check_window", "costs_kernel", "statistics", "volume"]
 
 LARGEST_WINDOW = 11
 """Side of the largest window whose sums fit the registers."""
@@ -208,6 +208,12 @@ def statistics(
     return image, sums, scales
 
 
+def check_window(cost: Zncc) -> None:
+    """Raise DeviceError if the window is larger than `LARGEST_WINDOW`."""
+    if cost.window > LARGEST_WINDOW:
+        raise DeviceError(f"window of zncc must be at most {LARGEST_WINDOW} on device 'cuda', got {cost.window}")
+
+
 def volume(queue: Queue, cost: Zncc, scene: Scene) -> Any:
     """Return the volume of costs of a pair, flat words on the device (`stereokit.costs.rows_cuda`).
 
@@ -216,8 +222,7 @@ def volume(queue: Queue, cost: Zncc, scene: Scene) -> Any:
     DeviceError
         If the window is larger than `LARGEST_WINDOW`.
     """
-    if cost.window > LARGEST_WINDOW:
-        raise DeviceError(f"window of zncc must be at most {LARGEST_WINDOW} on device 'cuda', got {cost.window}")
+    check_window(cost)
     height, width = scene.height, scene.width
     extremes = ranges(queue, scene.images, scene.dtype, height * width)
     first = -scene.levels.minimum - (scene.padded - 1)

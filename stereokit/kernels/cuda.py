@@ -2,7 +2,7 @@
 
 Nothing else imports numba.cuda, and nothing imports this module before a GPU is asked for: ``*_cuda`` modules hold
 the kernels, next to the CPU stage that each is the twin of, and `stereokit.pipeline_cuda` imports them late.
-``numba.cuda`` is NVIDIA's numba-cuda where that is installed, else the one that comes with numba.
+``numba.cuda`` is NVIDIA's numba-cuda; the one that comes with numba is deprecated and not used.
 
 A kernel is a plain Python function with the types of its arguments::
 
@@ -29,21 +29,16 @@ Rules that the kernels follow, because each was a trap once:
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
-from numba import types
+from llvmlite import ir
+from numba import cuda, types
 from numba.core import cgutils
-
-with warnings.catch_warnings():  # numba's own numba.cuda announces its end
-    warnings.simplefilter("ignore")
-    from llvmlite import ir
-    from numba import cuda
-    from numba.cuda import dispatcher as _dispatcher
-    from numba.extending import intrinsic
+from numba.cuda import dispatcher as _dispatcher
+from numba.extending import intrinsic
 
 __all__ = [
     "FULL",
@@ -122,7 +117,8 @@ class Kernel:
     def compiled(self) -> Any:
         """The kernel compiled for the present GPU: ``compiled[blocks, threads, stream](...)`` launches it."""
         if self._compiled is None:
-            self._compiled = cuda.jit([types.void(*self.signature)], fastmath=False)(self.function)
+            # Without link-time optimisation, so that what runs is the PTX that `ptx` returns.
+            self._compiled = cuda.jit(types.void(*self.signature), fastmath=False, lto=False)(self.function)
         return self._compiled
 
     def __repr__(self) -> str:
@@ -171,6 +167,9 @@ class Queue(Protocol):
 
     def launch(self, what: Kernel, blocks: int, *arguments: Any) -> None:
         """Run a kernel with so many blocks; scalars are converted to its signature."""
+
+    def copy(self, held: Any) -> Any:
+        """Return a new array on the device with the same content."""
 
     def fetch(self, held: Any) -> np.ndarray[Any, Any]:
         """Wait for all launches and return a copy of an array."""

@@ -36,8 +36,8 @@ def missing() -> str:
     library, reason = _driver()
     if library is None:
         return reason
-    if importlib.util.find_spec("numba_cuda") is None and importlib.util.find_spec("numba.cuda") is None:
-        return "numba.cuda is not installed"
+    if importlib.util.find_spec("numba_cuda") is None:
+        return "numba-cuda is not installed"
     return ""
 
 

@@ -28,12 +28,13 @@ from stereokit.kernels.cuda import (
     shuffle_from,
     shuffle_up,
     shuffle_xor,
+    u8,
     u16,
     u32,
 )
 from stereokit.selection.wta import margin_of, parabola
 
-__all__ = ["RULES", "Maps", "group_of", "lowest_of_group", "select", "select_kernel", "selector"]
+__all__ = ["RULES", "Maps", "doubt", "group_of", "lowest_of_group", "select", "select_kernel", "selector"]
 
 RULES = (i32, i32, i32, f32, i32)
 """Types of the number of levels, the lowest disparity, whether to interpolate, the least margin, and whether to write
@@ -165,6 +166,14 @@ def select_kernel(padded: int, floats: bool) -> Kernel:
 
     made: Kernel = select
     return made
+
+
+@kernel(array(f32), array(u8), i32, block=128)
+def doubt(confidence, valid, pixels):  # type: ignore[no-untyped-def]
+    """Set the confidence of pixels that are not valid to 0."""
+    at = u32(cuda.grid(1))
+    if at < u32(pixels) and valid[at] == 0:
+        confidence[at] = f32(0)
 
 
 for _padded in (32, 128, 512):

@@ -33,7 +33,7 @@ from stereokit.kernels.queue_cuda import DeviceQueue, stream_of
 from stereokit.postprocess.chain import Chain
 from stereokit.postprocess.chain_cuda import post_process
 from stereokit.result import Disparity
-from stereokit.selection.wta_cuda import Maps, doubt, select
+from stereokit.selection.wta_cuda import Maps, doubt
 
 __all__ = ["CudaPipeline", "DeviceDisparity", "Settings"]
 
@@ -294,9 +294,4 @@ def _aggregate(queue: Queue, settings: Settings, scene: Scene, guide: Any, maps:
     if isinstance(aggregation, Sgm):
         aggregate_sgm(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)
         return
-    floats = _floats(aggregation)
-
-    def select_band(totals: Any, first: int, band: int) -> None:
-        select(queue, totals, floats, first, band, shape, scene.padded, maps)
-
-    aggregate_dt(queue, aggregation, cost.cost_max, volume, guide, shape, scene.padded, select_band)
+    aggregate_dt(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)

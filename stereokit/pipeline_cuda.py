@@ -118,6 +118,11 @@ def _from_device(name: str, image: Any) -> _Image:
     return _Image(held.reshape(held.size), held.dtype, channels, tuple(held.shape[:2]))
 
 
+def _reshaped(held: Any, shape: Shape) -> Any:
+    """Return a flat array of the device as one of this shape."""
+    return held.reshape(*shape)
+
+
 def new_queue(stream: Any) -> Any:
     """Return a queue of the GPU on a stream of numba, or on one of its own."""
     return DeviceQueue(stream)
@@ -201,14 +206,14 @@ class CudaPipeline:
         shape = views[0].shape
         with self._queue(cuda.default_stream() if stream is None else stream_of(stream)) as queue:
             found = self._match_views(queue, views, False)
-            disparity, valid = (queue.copy(part).reshape(*shape) for part in found[:2])
-            confidence = None if found.confidence is None else queue.copy(found.confidence).reshape(*shape)
+            disparity, valid = (_reshaped(queue.copy(part), shape) for part in found[:2])
+            confidence = None if found.confidence is None else _reshaped(queue.copy(found.confidence), shape)
             other = None
             if self._settings.right:
                 mirrored = self._match_views(queue, views[::-1], True).disparity
                 out = queue.copy(mirrored)
                 queue.launch(flip, blocks_for(out.size, flip.block), mirrored, out, *shape)
-                other = out.reshape(*shape)
+                other = _reshaped(out, shape)
         return DeviceDisparity(disparity, valid, confidence, other)
 
     def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool) -> _Found:

@@ -36,6 +36,7 @@ class DeviceQueue:
         self.stream = cuda.stream() if stream is None else stream
         self._arrays: dict[str, Any] = {}
         self._pinned: dict[str, NDArray[Any]] = {}
+        self._copied: dict[str, Any] = {}  # events after which a pinned buffer may be written again
         self._keys: dict[str, Any] = {}
 
     def array(self, name: str, size: int, dtype: Any) -> Any:
@@ -72,14 +73,17 @@ class DeviceQueue:
         return held
 
     def upload(self, name: str, values: NDArray[Any]) -> Any:
-        """Return the resident flat array called `name` with a copy of `values` in it.
-
-        The pinned buffer is written at once: the caller has fetched what came of the last one.
-        """
+        """Return the resident flat array called `name` with a copy of `values` in it."""
+        copied = self._copied.get(name)
+        if copied is None:
+            copied = self._copied[name] = cuda.event(timing=False)
+        else:
+            copied.synchronize()  # the pinned buffer may still be on its way
         staging = self._staging(name, values.size, values.dtype)
         np.copyto(staging, values.reshape(-1))
         held = self.array(name, values.size, values.dtype)
         held.copy_to_device(staging, stream=self.stream)
+        copied.record(self.stream)
         return held
 
     def once(self, name: str, key: Any, make: Callable[[], NDArray[Any]]) -> Any:

@@ -220,7 +220,7 @@ def gaussian_weights(sigma: float) -> NDArray[np.uint32]:
     impulse[0, reach] = 65535
     spread = cv2.GaussianBlur(np.repeat(impulse, 3, axis=0), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)[1]
     half = reach - int(np.flatnonzero(spread)[0])
-    weights = spread[reach - half : reach + half + 1].astype(np.uint32)
+    weights: NDArray[np.uint32] = spread[reach - half : reach + half + 1].astype(np.uint32)
     weights[half] = 65536 - (int(weights.sum()) - int(weights[half]))
     return weights
 

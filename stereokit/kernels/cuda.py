@@ -54,6 +54,7 @@ __all__ = [
     "kernel",
     "load2",
     "load4",
+    "load_relaxed",
     "shuffle_down",
     "shuffle_from",
     "shuffle_up",
@@ -207,12 +208,12 @@ def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any, lane
 
 
 def _loader(lanes: int) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @intrinsic
     def load(typingctx, array, index):  # type: ignore[no-untyped-def]
         width = array.dtype.bitwidth // 8 * lanes
 
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-            pointer, _ = _pointer(context, builder, signature.args[0], *arguments, lanes)
+            pointer, _ = _pointer(context, builder, signature.args[0], arguments[0], arguments[1], lanes)
             vector = builder.load(pointer, align=width)
             parts = [builder.extract_element(vector, ir.Constant(ir.IntType(32), k)) for k in range(lanes)]
             return cgutils.pack_array(builder, parts)
@@ -223,12 +224,12 @@ def _loader(lanes: int) -> Any:
 
 
 def _storer(lanes: int) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @intrinsic
     def store(typingctx, array, index, values):  # type: ignore[no-untyped-def]
         width = array.dtype.bitwidth // 8 * lanes
 
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-            pointer, vector_type = _pointer(context, builder, signature.args[0], *arguments[:2], lanes)
+            pointer, vector_type = _pointer(context, builder, signature.args[0], arguments[0], arguments[1], lanes)
             vector = ir.Constant(vector_type, ir.Undefined)
             for k in range(lanes):
                 part = builder.extract_value(arguments[2], k)
@@ -246,3 +247,16 @@ load2, load4 = _loader(2), _loader(4)
 
 store2, store4 = _storer(2), _storer(4)
 """``store4(array, index, (a, b, c, d))``: write 4 elements from `index` on, a multiple of 4, in one instruction."""
+
+
+@intrinsic
+def load_relaxed(typingctx, array, index):  # type: ignore[no-untyped-def]
+    """Return an element of a uint32 array that other threads change by atomics meanwhile; never from a stale cache."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        held = context.make_array(signature.args[0])(context, builder, arguments[0])
+        address = builder.ptrtoint(builder.gep(held.data, [arguments[1]]), ir.IntType(64))
+        kind = ir.FunctionType(ir.IntType(32), [ir.IntType(64)])
+        return builder.asm(kind, "ld.relaxed.gpu.global.u32 $0, [$1];", "=r,l,~{memory}", [address], True)
+
+    return types.uint32(array, types.uint64), generate

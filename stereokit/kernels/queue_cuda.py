@@ -115,4 +115,5 @@ class DeviceQueue:
         staging = self._staging(f"fetch.{held.dtype}", held.size, held.dtype)
         held.copy_to_host(staging, stream=self.stream)
         self.stream.synchronize()
-        return staging.copy()
+        out: NDArray[Any] = staging.copy()
+        return out

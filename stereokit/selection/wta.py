@@ -52,13 +52,15 @@ def _best_level(keys: NDArray[Any], at: int, blocks: tuple[int, ...]) -> tuple[A
 def parabola(before: np.float32, best: np.float32, behind: np.float32) -> np.float32:
     """Return where between its neighbours the lowest point of three costs lies, as an offset in levels."""
     bend = before + behind - np.float32(2) * best
-    return (before - behind) / (np.float32(2) * bend) if bend > np.float32(0) else np.float32(0)
+    offset: np.float32 = (before - behind) / (np.float32(2) * bend) if bend > np.float32(0) else np.float32(0)
+    return offset
 
 
 @inline
 def margin_of(best: np.float32, rival: np.float32) -> np.float32:
     """Return by which share of the rival's cost the best one is lower."""
-    return (rival - best) / rival if rival > np.float32(0) else np.float32(0)
+    share: np.float32 = (rival - best) / rival if rival > np.float32(0) else np.float32(0)
+    return share
 
 
 @inline

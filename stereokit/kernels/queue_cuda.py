@@ -5,6 +5,7 @@ Host memory goes through pinned buffers, so that copies run on the stream like e
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -38,6 +39,7 @@ class DeviceQueue:
         self._pinned: dict[str, NDArray[Any]] = {}
         self._copied: dict[str, Any] = {}  # events after which a pinned buffer may be written again
         self._keys: dict[str, Any] = {}
+        self._configured: dict[tuple[str, int], Any] = {}
 
     def array(self, name: str, size: int, dtype: Any) -> Any:
         """Return the resident flat array called `name`; its content is whatever it was.
@@ -102,7 +104,13 @@ class DeviceQueue:
 
     def launch(self, what: Kernel, blocks: int, *arguments: Any) -> None:
         """Run a kernel with so many blocks; scalars are converted to its signature."""
-        what.compiled[blocks, what.block, self.stream](*arguments)
+        configured = self._configured.get((what.name, blocks))
+        if configured is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # numba warns of every grid of less than 128 blocks
+                configured = what.compiled[blocks, what.block, self.stream]
+            self._configured[what.name, blocks] = configured
+        configured(*arguments)
 
     def copy(self, held: Any) -> Any:
         """Return a new array on the device with the same content."""

@@ -47,6 +47,9 @@ __all__ = [
 
 KINDS = {np.dtype(np.uint8): u8, np.dtype(np.uint16): u16}
 
+_PARTS = 32
+"""Blocks that look at one image for its range: as many as a warp has lanes."""
+
 
 def blocks_for(threads: int, block: int) -> int:
     """Return how many blocks make up at least so many threads."""
@@ -156,7 +159,7 @@ def blur_columns(rows, weights, half, out, count, height, width):  # type: ignor
 
 @cache
 def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
-    """Return the kernel that finds the smallest and the largest pixel of each image; one block for each."""
+    """Return the kernel that finds the smallest and the largest pixel of each of `_PARTS` parts of both images."""
     kind = KINDS[dtype]
     threads = 256
 
@@ -165,13 +168,14 @@ def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
         lows = cuda.shared.array(8, i32)
         highs = cuda.shared.array(8, i32)
         thread = u32(cuda.threadIdx.x)
-        image = u32(cuda.blockIdx.x)
+        block = u32(cuda.blockIdx.x)
+        first = u32(u32(block // u32(_PARTS)) * u32(pixels))
         low, high = i32(65535), i32(0)
-        at = thread
+        at = u32(u32(u32(block % u32(_PARTS)) * u32(threads)) + thread)
         while at < u32(pixels):
-            value = i32(images[u32(u32(image * u32(pixels)) + at)])
+            value = i32(images[u32(first + at)])
             low, high = min(low, value), max(high, value)
-            at = u32(at + u32(threads))
+            at = u32(at + u32(threads * _PARTS))
         for mask in (16, 8, 4, 2, 1):
             low = min(low, shuffle_xor(low, mask))
             high = max(high, shuffle_xor(high, mask))
@@ -183,11 +187,25 @@ def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
             for warp in range(1, 8):
                 low = min(low, lows[u32(warp)])
                 high = max(high, highs[u32(warp)])
-            out[u32(u32(2) * image)] = low
-            out[u32(u32(2) * image + u32(1))] = high
+            out[u32(u32(2) * block)] = low
+            out[u32(u32(2) * block + u32(1))] = high
 
     made: Kernel = ranges
     return made
+
+
+@kernel(array(i32), array(i32), block=64)
+def join_ranges(parts, out):  # type: ignore[no-untyped-def]
+    """Find the smallest and the largest pixel of each image from those of its parts, a lane to a part."""
+    thread = u32(cuda.threadIdx.x)
+    low = parts[u32(u32(2) * thread)]
+    high = parts[u32(u32(2) * thread + u32(1))]
+    for mask in (16, 8, 4, 2, 1):
+        low = min(low, shuffle_xor(low, mask))
+        high = max(high, shuffle_xor(high, mask))
+    if thread & u32(31) == 0:
+        out[u32(thread >> u32(4))] = low
+        out[u32(u32(thread >> u32(4)) + u32(1))] = high
 
 
 @kernel(array(f32), array(f32), i32, i32, block=128)
@@ -261,6 +279,8 @@ def smooth(queue: Queue, images: Any, dtype: np.dtype[Any], sigma: float, shape:
 
 def ranges(queue: Queue, images: Any, dtype: np.dtype[Any], pixels: int) -> Any:
     """Return (4,) int32 on the device: smallest and largest pixel of the left image, then of the right one."""
+    parts = queue.array("ranges.parts", 4 * _PARTS, np.int32)
     out = queue.array("ranges", 4, np.int32)
-    queue.launch(ranges_kernel(dtype), 2, images, out, pixels)
+    queue.launch(ranges_kernel(dtype), 2 * _PARTS, images, parts, pixels)
+    queue.launch(join_ranges, 1, parts, out)
     return out

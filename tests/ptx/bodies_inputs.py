@@ -68,7 +68,7 @@ def check_blurred(queue, dtype=np.uint8, sigmas=(0.3, 0.7, 2.0)):
 
 
 def check_ranges(queue, dtype=np.uint8):
-    for shape in ((1, 1), (19, 33)):
+    for shape in ((1, 1), (19, 33), (130, 70)):
         pair = _pair(shape, dtype)
         out = inputs_cuda.ranges(queue, queue.upload("in", pair), np.dtype(dtype), pair[0].size)
         want = [pair[0].min(), pair[0].max(), pair[1].min(), pair[1].max()]

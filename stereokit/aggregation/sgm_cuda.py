@@ -4,7 +4,7 @@ A path is walked by 8, 16 or 32 lanes of a warp, four levels or more to a lane; 
 levels on either side of a lane's come by shuffles, and so does the smallest cost. One launch walks all directions but
 the last, lines along the rows first, as they are the longest; each writes its path costs, a byte to a level. A second
 launch walks the last direction, up the columns, adds what the others left and selects at once, so that neither the
-last path nor the sum is ever stored.
+last path nor the sum is ever stored. Both ask for the words of the next pixel before they work on the present one.
 
 A line along the image's height begins at every column, whatever its slant: where it leaves the image on one side it
 goes on as a new path on the other one. So all lines of a direction are equally long and every pixel lies on one.
@@ -210,6 +210,7 @@ def final_kernel(padded: int, others: int) -> Kernel:
     load = _words_loader(words)
     step = _stepper(padded)
     choose = selector(padded, False)
+    stored_words = words * others
     even = np.uint32(0x00FF00FF)
     maps = array(f32), array(u16), array(f32), *RULES
     types = array(u32), array(u8), array(u32), i32, i32, i32
@@ -231,40 +232,46 @@ def final_kernel(padded: int, others: int) -> Kernel:
         total = cuda.local.array(held, i32)
         coming = cuda.local.array(words, u32)
         present = cuda.local.array(words, u32)
-        lows = cuda.local.array(words, u32)
-        highs = cuda.local.array(words, u32)
+        ahead = cuda.local.array(stored_words, u32)
+        part = cuda.local.array(words, u32)
         for k in range(held):
             path[k] = i32(0)
         low = i32(0)
         at = u32(u32(u32(y) * u32(width)) + u32(x))
         load(costs, u64(u32(u32(at * u32(span)) + u32(place * i32(words)))), coming)
         before = i32(guide[at])
+        for n in range(others):
+            load(stored, u64(u32(u32(at * u32(span)) + u32(place * i32(words)))) + u64(n) * volume, part)
+            for j in range(words):
+                ahead[n * words + j] = part[j]
         for _ in range(height):
             pixel = at
-            source = u64(u32(u32(at * u32(span)) + u32(place * i32(words))))
             grey = i32(guide[at])
             for j in range(words):
                 present[j] = coming[j]
-                lows[j] = u32(0)
-                highs[j] = u32(0)
-            for n in range(others):
-                load(stored, source + u64(n) * volume, coming)
-                for j in range(words):
-                    lows[j] = u32(lows[j] + u32(coming[j] & even))
-                    highs[j] = u32(highs[j] + u32(u32(coming[j] >> u32(8)) & even))
+                low_sum, high_sum = u32(0), u32(0)
+                for n in range(others):
+                    low_sum = u32(low_sum + u32(ahead[n * words + j] & even))
+                    high_sum = u32(high_sum + u32(u32(ahead[n * words + j] >> u32(8)) & even))
+                total[4 * j] = i32(low_sum & u32(0xFFFF))
+                total[4 * j + 1] = i32(high_sum & u32(0xFFFF))
+                total[4 * j + 2] = i32(low_sum >> u32(16))
+                total[4 * j + 3] = i32(high_sum >> u32(16))
             y = i32(min(max(i32(y + dy), i32(0)), i32(height - 1)))
             at = u32(u32(u32(y) * u32(width)) + u32(x))
-            load(costs, u64(u32(u32(at * u32(span)) + u32(place * i32(words)))), coming)
+            source = u64(u32(u32(at * u32(span)) + u32(place * i32(words))))
+            load(costs, source, coming)
+            for n in range(others):
+                load(stored, source + u64(n) * volume, part)
+                for j in range(words):
+                    ahead[n * words + j] = part[j]
             jump = i32(abs(i32(grey - before)))
             before = grey
             small = p1_edge if jump >= edge else p1
             large = p2_edge if jump >= edge else p2
             low = step(path, present, low, small, large, place)
-            for j in range(words):
-                total[4 * j] = i32(path[4 * j] + i32(lows[j] & u32(0xFFFF)))
-                total[4 * j + 1] = i32(path[4 * j + 1] + i32(highs[j] & u32(0xFFFF)))
-                total[4 * j + 2] = i32(path[4 * j + 2] + i32(lows[j] >> u32(16)))
-                total[4 * j + 3] = i32(path[4 * j + 3] + i32(highs[j] >> u32(16)))
+            for k in range(held):
+                total[k] = i32(total[k] + path[k])
             choose(
                 total, lane, pixel, alive, disparity, cost, confidence, levels, minimum, subpixel, uniqueness, confident
             )

@@ -23,7 +23,7 @@ def test_paths(paths):
 
 @pytest.mark.parametrize(
     ("shape", "count"),
-    [((1, 1), 1), ((1, 7), 2), ((7, 1), 33), ((3, 5), 64), ((4, 3), 65), ((3, 3), 140), ((2, 3), 600)],
+    [((1, 1), 1), ((1, 7), 2), ((7, 1), 33), ((3, 5), 64), ((4, 3), 65), ((3, 3), 129), ((2, 3), 385)],
 )
 def test_sizes_and_levels(shape, count):
     bodies.check_paths(EmulatedQueue(), Sgm(15, 85, paths=8), shape, count)

@@ -8,6 +8,7 @@ from stereokit.calibration import Calibration
 from stereokit.costs import Census, RowCost, Zncc
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
 from stereokit.io import read_disparity, read_image, write_disparity
+from stereokit.large import LargeResult, match_large
 from stereokit.matching import METHODS, Matcher, match, warmup
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
@@ -24,6 +25,7 @@ __all__ = [
     "Disparity",
     "FileError",
     "InputError",
+    "LargeResult",
     "Matcher",
     "OptionError",
     "RowCost",
@@ -34,6 +36,7 @@ __all__ = [
     "aggregate",
     "cost_volume",
     "match",
+    "match_large",
     "read_disparity",
     "read_image",
     "select",

@@ -140,11 +140,14 @@ def match(
     ] = None,
     cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
     ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Also a point cloud, metres.")] = None,
+    memory: Annotated[str | None, typer.Option(metavar="BYTES", help="Match in windows that fit, such as 2GB.")] = None,
+    overlap: Annotated[int | None, typer.Option(help="Margin of the windows of --memory, pixels.")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Match LEFT and RIGHT and write the disparity map.
 
-    Everything is checked before matching starts. The first run on a machine also compiles, once.
+    Everything is checked before matching starts. The first run on a machine also compiles, once. With --memory the
+    images (.npy, .tiff or any other) are matched in windows, and the map goes to .npy or tiled .tiff as it grows.
     """
     import numpy as np
 
@@ -162,7 +165,7 @@ def match(
     for name, path in outputs.items():
         io.check_output(path, suffixes[name], name)
         if name in ("--output", "--right") and path.suffix.lower() == ".png":
-            _check_fits_png(name, min_disparity, max_disparity)
+            commandline.check_fits_png(name, min_disparity, max_disparity)
     outputs.update(commandline.check_json(json_file))
     _check_distinct({"LEFT": left, "RIGHT": right_image, "--calibration": calibration}, outputs)
     if (ply is None) != (calibration is None):
@@ -170,19 +173,27 @@ def match(
     options = commandline.parse_settings(settings or [])
     wanted = {"fill": fill, "right": right and True, "confidence": confidence and True}
     options.update({name: value for name, value in wanted.items() if value is not None})
+    matching: dict[str, Any] = {
+        "max_disparity": max_disparity,
+        "min_disparity": min_disparity,
+        "scale": scale,
+        "refiner": refiner,
+        "threads": threads,
+        "device": device,
+    }
+    if memory is not None or overlap is not None:
+        for name in ("--color", "--right", "--confidence", "--ply"):
+            if name in outputs:
+                raise OptionError(f"{name} is not available with --memory and --overlap")
+        from stereokit.large.command import match_in_windows
+
+        done, shown = match_in_windows(left, right_image, output, method, memory, overlap, {**matching, **options})
+        _report({**done, "options": options, "version": _version("stereokit")}, [shown], json_file)
+        return
 
     from stereokit.matching import Matcher
 
-    matcher = Matcher(
-        method,
-        max_disparity=max_disparity,
-        min_disparity=min_disparity,
-        scale=scale,
-        refiner=refiner,
-        threads=threads,
-        device=device,
-        **options,
-    )
+    matcher = Matcher(method, **matching, **options)
     images = io.read_image(left), io.read_image(right_image)
     height, width = images[0].shape[:2]
     if images[1].shape[:2] != (height, width):
@@ -328,12 +339,6 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _check_fits_png(name: str, min_disparity: int, max_disparity: int) -> None:
-    if min_disparity < 0 or max_disparity > 256:
-        span = f"{min_disparity} .. {max_disparity}"
-        raise OptionError(f"{name}: a KITTI .png holds disparities in 0 .. 256, got {span}; use .pfm or .npy")
 
 
 def _check_distinct(inputs: dict[str, Path | None], outputs: dict[str, Path]) -> None:

@@ -15,7 +15,7 @@ import typer
 
 from stereokit.errors import OptionError
 
-__all__ = ["JsonOption", "check_json", "parse_settings", "write_json"]
+__all__ = ["JsonOption", "check_fits_png", "check_json", "parse_settings", "write_json"]
 
 _OWN_OPTIONS = frozenset(  # not through --set
     "method max_disparity min_disparity scale refiner fill threads device right confidence".split()
@@ -53,6 +53,19 @@ def parse_settings(settings: Iterable[str], own: frozenset[str] = _OWN_OPTIONS) 
             raise OptionError(f"--set {key} must be given once, got it twice")
         options[key] = _value(text.strip())
     return options
+
+
+def check_fits_png(name: str, min_disparity: int, max_disparity: int) -> None:
+    """Refuse disparities that a KITTI png does not hold, for the option `name`.
+
+    Raises
+    ------
+    OptionError
+        If some lie outside 0 .. 256.
+    """
+    if min_disparity < 0 or max_disparity > 256:
+        span = f"{min_disparity} .. {max_disparity}"
+        raise OptionError(f"{name}: a KITTI .png holds disparities in 0 .. 256, got {span}; use .pfm or .npy")
 
 
 def check_json(path: Path | None) -> dict[str, Path]:

@@ -90,7 +90,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["DEFAULTS", "METHODS"]
+__all__ = ["DEFAULTS", "HALF", "METHODS", "defaults_of"]
 
 METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+sgm"}
 """The four matchers of the StereoVAE paper."""
@@ -114,3 +114,16 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "zncc+sgm": {"p1": 20 / 31, "p2": 120 / 31},
 }
 """Options by method; those under the empty name hold for all methods that do not say otherwise."""
+
+HALF: dict[str, dict[str, Any]] = {
+    "census+dt": {"sigma_s": 14, "sigma_v": 4, "smooth": 0.4},
+    "census+sgm": {"smooth": 0.4},
+    "zncc+dt": {"sigma_s": 14, "sigma_v": 4, "smooth": 0.4},
+    "zncc+sgm": {"smooth": 0.4, "window": 3},
+}
+"""What is different where a pair is matched at half size: a pixel is twice as wide there, and smooth already."""
+
+
+def defaults_of(method: str, *, half: bool = False) -> dict[str, Any]:
+    """Return all options of a method by name, ``"cost+aggregation"``, at full or at half size."""
+    return {**DEFAULTS[""], **DEFAULTS.get(method, {}), **(HALF.get(method, {}) if half else {})}

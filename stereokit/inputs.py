@@ -26,10 +26,15 @@ __all__ = [
     "check_integer",
     "check_names",
     "check_number",
+    "checked_image",
+    "fill_bad",
     "gray_pair",
     "guide_of",
     "half_size",
+    "scale_guide",
+    "scale_to_16_bits",
     "smooth",
+    "to_gray",
 ]
 
 MAX_DISPARITY = 2**20
@@ -50,6 +55,9 @@ class GrayPair:
         Pixels that were NaN or infinite; None when there are none.
     guide : (H, W) uint8
         The left image in 256 grey levels.
+    ranges : ((int, int), (int, int)) or None
+        Smallest and largest value of either image as a cost sees it, halved and smoothed, where this pair is a
+        window of larger images; None where it is the whole.
     """
 
     left: NDArray[Any]
@@ -57,6 +65,7 @@ class GrayPair:
     left_bad: NDArray[np.bool_] | None
     right_bad: NDArray[np.bool_] | None
     guide: NDArray[np.uint8]
+    ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
 
 def check_integer(name: str, value: Any, low: int | None = None, high: int | None = None) -> int:
@@ -97,7 +106,7 @@ def writable(array: Any) -> NDArray[Any]:
     return contiguous if contiguous.flags.writeable else contiguous.copy()
 
 
-def _checked(name: str, image: Any) -> NDArray[Any]:
+def checked_image(name: str, image: Any) -> NDArray[Any]:
     """Return an image of an accepted type and shape, (H, W) or (H, W, 3)."""
     if isinstance(image, np.ma.MaskedArray):
         raise InputError(f"{name} must be a plain array, got a masked one; put NaN where there is no evidence")
@@ -120,7 +129,8 @@ def _checked(name: str, image: Any) -> NDArray[Any]:
     return array
 
 
-def _gray(array: NDArray[Any]) -> NDArray[Any]:
+def to_gray(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a checked image in grey: 0.299 R + 0.587 G + 0.114 B."""
     if array.ndim == 2:
         return array
     if array.dtype == np.float64:
@@ -142,7 +152,7 @@ def _whole_numbers(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any
     return left, right
 
 
-def _fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
+def fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
     """Return `image` with bad pixels replaced by the nearest good one before them on the row, else behind."""
     width = image.shape[1]
     columns = np.where(bad, -1, np.arange(width))
@@ -163,11 +173,13 @@ def _integers(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], ND
     if high <= low:
         return np.zeros(left.shape, np.uint8), np.zeros(right.shape, np.uint8)
 
-    def scale(image: NDArray[Any]) -> NDArray[np.uint16]:
-        share = (image.astype(np.float64) / 2 - low / 2) / (high / 2 - low / 2)  # halves: no overflow
-        return np.rint(share * 65535).astype(np.uint16)
+    return scale_to_16_bits(left, low, high), scale_to_16_bits(right, low, high)
 
-    return scale(left), scale(right)
+
+def scale_to_16_bits(image: NDArray[Any], low: float, high: float) -> NDArray[np.uint16]:
+    """Return finite floats from `low` to `high` as whole numbers from 0 to 65535."""
+    share = (image.astype(np.float64) / 2 - low / 2) / (high / 2 - low / 2)  # halves: no overflow
+    return np.rint(share * 65535).astype(np.uint16)
 
 
 def gray_pair(left: Any, right: Any) -> GrayPair:
@@ -183,14 +195,14 @@ def gray_pair(left: Any, right: Any) -> GrayPair:
     InputError
         If an image has another shape or type, is empty, or the two differ.
     """
-    a, b = _checked("left", left), _checked("right", right)
+    a, b = checked_image("left", left), checked_image("right", right)
     if a.dtype != b.dtype:
         raise InputError(f"left and right must have the same type, got {a.dtype} and {b.dtype}")
     if a.shape[:2] != b.shape[:2]:
         raise InputError(f"left and right must have the same size, got {a.shape[:2]} and {b.shape[:2]}")
     if a.dtype.kind == "f":
         a, b = _whole_numbers(a, b)
-    a, b = _gray(a), _gray(b)
+    a, b = to_gray(a), to_gray(b)
     bad: list[NDArray[np.bool_] | None] = [None, None]
     if a.dtype.kind == "f":
         images = [a, b]
@@ -198,7 +210,7 @@ def gray_pair(left: Any, right: Any) -> GrayPair:
             finite = np.isfinite(image)
             if not finite.all():
                 bad[k] = ~finite
-                images[k] = _fill_bad(image, ~finite)
+                images[k] = fill_bad(image, ~finite)
         a, b = _whole_numbers(*images)
         if a.dtype.kind == "f":
             a, b = _integers(a, b)
@@ -214,7 +226,12 @@ def guide_of(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint8]:
         return left
     low = min(int(left.min()), int(right.min()))
     high = max(int(left.max()), int(right.max()))
-    scaled = (left.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1))
+    return scale_guide(left, low, high)
+
+
+def scale_guide(image: NDArray[Any], low: int, high: int) -> NDArray[np.uint8]:
+    """Return grey values from `low` to `high` in 256 levels."""
+    scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1))
     return np.asarray(np.rint(scaled), np.uint8)
 
 
@@ -246,7 +263,7 @@ def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, thr
         cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
 
     run([partial(blur, 0), partial(blur, 1)], threads)
-    return GrayPair(blurred[0], blurred[1], pair.left_bad, pair.right_bad, pair.guide)
+    return GrayPair(blurred[0], blurred[1], pair.left_bad, pair.right_bad, pair.guide, pair.ranges)
 
 
 def half_size(pair: GrayPair) -> GrayPair:
@@ -270,4 +287,4 @@ def half_size(pair: GrayPair) -> GrayPair:
 
     left, right = shrink(pair.left), shrink(pair.right)
     guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
-    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide)
+    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide, pair.ranges)

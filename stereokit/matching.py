@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Levels, Pair
-from stereokit.defaults import DEFAULTS, METHODS
+from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import (
     GrayPair,
@@ -134,6 +134,7 @@ class Matcher:
         if self.scale == 0.5:
             self.refiner, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
             self._refine = factory(**{k: options[k] for k in refiner_options if k in options})
+        self._needs_confidence = bool(getattr(self._refine, "needs_confidence", False))
         self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
         self._pool = Pool()
         self.device = "cpu"
@@ -146,7 +147,8 @@ class Matcher:
 
         settings = Settings(
             self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
-            self.uniqueness, self.confidence, self.right, self.smp, self.speckle, self.fill, self.median,
+            self.uniqueness, self.confidence or self._needs_confidence, self.right, self.smp, self.speckle, self.fill,
+            self.median,
         )  # fmt: skip
         try:
             self._cuda = CudaPipeline(settings)
@@ -167,7 +169,7 @@ class Matcher:
         cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         cost_options, aggregation_options = option_names(cost), option_names(aggregation)
         check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options, *elsewhere}))
-        merged = {**DEFAULTS[""], **DEFAULTS.get(self.method, {}), **options}
+        merged = {**defaults_of(self.method, half=self.scale == 0.5), **options}
         self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
         if "p2" not in options and "p2" in merged:  # a default gives way to what the cost leaves of 8 bits
             merged["p2"] = min(merged["p2"], (255 - self.cost.cost_max) / self.cost.unit)
@@ -310,34 +312,38 @@ class Matcher:
     def _call(self, left: Any, right: Any, threads: int) -> Disparity:
         pair = gray_pair(left, right)
         with self._pool.take() as workspace:
-            full = self._match(pair, workspace, threads)
+            full = self.match_gray(pair, workspace, threads)
             if not self.right:
                 return full
-            mirrored = self._match(_mirror(pair), workspace, threads)
+            mirrored = self.match_gray(_mirror(pair), workspace, threads)
         other = np.ascontiguousarray(mirrored.disparity[:, ::-1])
         return Disparity(full.disparity, full.valid, full.confidence, other)
 
-    def _match(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
+    def match_gray(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
+        """Match a pair that was checked and is grey, with buffers of the caller; no right view's map."""
         if self._cuda is not None:
             found = self._cuda.host(pair)
         else:
             with crew(threads):
                 same = self._refine is None
                 found = self._match_with_crew(pair if same else half_size(pair), self._levels(), workspace, threads)
-        return found if self._refine is None else self._refine(found, pair.guide, threads=threads)
+        if self._refine is None:
+            return found
+        refined = self._refine(found, pair.guide, threads=threads)
+        return refined if self.confidence else Disparity(refined.disparity, refined.valid)
 
     def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
         low = levels.minimum
         pair = smooth(pair, self.smooth, workspace, threads)
         shape = pair.left.shape
         rows = self.cost.prepare(
-            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads),
+            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads, pair.ranges),
             workspace,
             max(2, threads),
         )
         disparity = workspace.array("match.disparity", shape, np.float32)
         cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
-        confidence = np.empty(shape, np.float32) if self.confidence else None
+        confidence = np.empty(shape, np.float32) if self.confidence or self._needs_confidence else None
         out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness)
         self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, threads, out)
         chain = Chain(self.smp, int(self.speckle * disparity.size), self.fill, self.median, low)
@@ -355,7 +361,8 @@ def _mirror(pair: GrayPair) -> GrayPair:
 
     left, right = flip(pair.right), flip(pair.left)
     assert left is not None and right is not None
-    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right))
+    ranges = None if pair.ranges is None else (pair.ranges[1], pair.ranges[0])
+    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges)
 
 
 _matchers: dict[Any, Matcher] = {}

@@ -17,13 +17,13 @@ _REDRAW_S = 0.2
 
 
 @contextmanager
-def progress(total: int) -> Iterator[tuple[Console, Callable[..., None]]]:
+def progress(total: int | None) -> Iterator[tuple[Console, Callable[..., None]]]:
     """Show a bar on standard error after the first second, where that is a terminal.
 
     Parameters
     ----------
-    total : int
-        Steps of the whole work.
+    total : int or None
+        Steps of the whole work, None where that is not known.
 
     Yields
     ------

@@ -6,7 +6,7 @@ among the validation frames 000000-000003 and 000034-000040) and on Middlebury's
 A setting is chosen by the tuning column and the three scenes; validation is printed beside it and not searched on.
 
 `DIR` holds ``kitti2015`` and ``middlebury/{2003/cones, 2003/teddy, 2014/Motorcycle}``. Rows are appended to the CSV
-as they are done; settings that are in it are not run again.
+as they are done; settings that are in it are not run again. ``--scale 0.5`` searches the defaults of half size.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SCENES = ("cones", "teddy", "Motorcycle")
 COLUMNS = ["method", "options", "tuning", "validation", "all", *SCENES]
 
 _COMMON: dict[str, list[Any]] = {
-    "smooth": [0, 0.5, 0.6, 0.7, 0.8, 1.0],
+    "smooth": [0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0],
     "outside": [0.3, 0.5, 0.7, 1.0, None],
     "smp": [False],
     "speckle": [0, 0.0001, 0.0002, 0.0003, 0.0005, 0.001],
@@ -59,15 +59,16 @@ _STAGES: dict[str, dict[str, list[Any]]] = {
 }
 
 
-def settings(method: str) -> Iterator[dict[str, Any]]:
+def settings(method: str, scale: float = 1) -> Iterator[dict[str, Any]]:
     """Yield the defaults (no option), then every single change of one option of `method`."""
-    yield {}
+    base: dict[str, Any] = {} if scale == 1 else {"scale": scale}
+    yield base
     name = parse_method(method)
     cost, aggregation = name.split("+")
     for group in (_COMMON, _STAGES[cost], _STAGES[aggregation], _STAGES.get(name, {})):
         for option, values in group.items():
             for value in values:
-                yield {option: value}
+                yield {**base, option: value}
 
 
 def _d1(frames: list[Frame], matcher: Matcher) -> tuple[int, int]:
@@ -100,6 +101,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder of kitti2015 and middlebury")
     parser.add_argument("--method", choices=sorted(METHODS), action="append", help="default: all four")
+    parser.add_argument("--scale", type=float, choices=(1, 0.5), default=1, help="0.5: at half size, upscaled")
     parser.add_argument("--output", type=Path, required=True, help="CSV that rows are appended to")
     given = parser.parse_args(argv)
     kitti = kitti2015(given.data / "kitti2015")
@@ -113,7 +115,7 @@ def main(argv: list[str] | None = None) -> None:
         if not done:
             writer.writeheader()
         for method in given.method or sorted(METHODS):
-            for options in settings(method):
+            for options in settings(method, given.scale):
                 if (method, json.dumps(options)) in done:
                     continue
                 row = _row(method, options, kitti, scenes)

@@ -62,6 +62,7 @@ def train(
     check_json(json_file)
     torch = _torch()
     from stereokit_refiners.encode import check_form
+    from stereokit_refiners.samples import Shelf, store_variant
     from stereokit_refiners.training import Source
     from stereokit_refiners.weights import NETWORKS, read
 
@@ -102,27 +103,22 @@ def train(
     held = output / "cache" if cache is None else cache
     world = _join_group(torch)
 
-    def samples(which: Sequence[Frame], numbers: range, step: Callable[..., None]) -> list[Any]:
-        from stereokit_refiners.samples import load_variant
-
+    def stored(frame: Frame, numbers: range, step: Callable[..., None]) -> list[Path]:
+        pair = pair_of(frame)
         found = []
-        for frame in which:
-            pair = pair_of(frame)
-            for name in methods:
-                for number in numbers:
-                    found.append(load_variant(pair, name, chosen.seed, number, max_disparity, held))
-                    step(f"{frame.name} {name}")
+        for name in methods:
+            for number in numbers:
+                found.append(store_variant(pair, name, chosen.seed, number, max_disparity, held))
+                step(f"{frame.name} {name}")
         return found
 
-    def street_samples(step: Callable[..., None]) -> list[Any]:
-        from stereokit_refiners.samples import load_variant
-
+    def stored_streets(step: Callable[..., None]) -> list[Path]:
         found = []
         for k in range(streets):
             pair = scene_pair(FIRST_SEED + k, held)
             for n in (0, 1):
                 name = methods[(k + 2 * n) % len(methods)]
-                found.append(load_variant(pair, name, chosen.seed, n + 1, max_disparity, held))
+                found.append(store_variant(pair, name, chosen.seed, n + 1, max_disparity, held))
                 step(pair.name)
         return found
 
@@ -130,20 +126,20 @@ def train(
     tested = {frame.name: frame for _, held_out in groups for frame in held_out}
     total = (len(trained) * variants + len(tested)) * len(methods) + 2 * streets
     with progress(total) as (_, step):
-        maps = {name: samples([frame], range(variants), step) for name, frame in trained.items()}
-        truth = {name: samples([frame], range(1), step) for name, frame in tested.items()}
-        scenes = street_samples(step)
+        maps = {name: stored(frame, range(variants), step) for name, frame in trained.items()}
+        truth = {name: stored(frame, range(1), step) for name, frame in tested.items()}
+        scenes = stored_streets(step)
     results = []
     for number, (training, held_out) in enumerate(groups):
-        mine = [sample for frame in training for sample in maps[frame.name]]
-        others = [sample for name in more for sample in maps[name]]
+        mine = [path for frame in training for path in maps[frame.name]]
+        others = [path for name in more for path in maps[name]]
         of_streets = (street_share if mine or others else 1.0) if scenes else 0.0
         of_others = (extra_share if mine else 1 - of_streets) if others else 0.0
         shares = ((scenes, of_streets), (mine, 1 - of_streets - of_others), (others, of_others))
-        sources = [Source(samples, share) for samples, share in shares if samples and share > 0]
+        sources = [Source(Shelf(paths), share) for paths, share in shares if paths and share > 0]
         folder = output if folds is None else output / f"fold-{number}"
         where = [(frame.name, name) for frame in held_out for name in methods]
-        looked_at = [sample for frame in held_out for sample in truth[frame.name]]
+        looked_at = Shelf([path for frame in held_out for path in truth[frame.name]])
         seen = [*(f"{dataset}/{frame.name}" for frame in training), *more]
         outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world, seen)
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})

@@ -110,8 +110,8 @@ def head_graph(network: Network, weights: Weights) -> onnx.ModelProto:
 def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
     """Return the whole refiner as a graph, with what `encode` and `compose` do.
 
-    Inputs ``coarse``, (1, 1, h, w), half-size pixels, filled; ``valid``, (1, 1, h, w), 0 or 1, for networks that
-    use it; ``left``, (1, 1, 2h, 2w), grey levels 0 to 255. Output ``disparity``, (1, 1, 2h, 2w), full-size pixels.
+    Inputs ``coarse``, (1, 1, h, w), half-size pixels, filled; ``confidence``, (1, 1, h, w), 0 to 1, for networks
+    that use it; ``left``, (1, 1, 2h, 2w), grey levels 0 to 255. Output ``disparity``, (1, 1, 2h, 2w), full-size pixels.
     """
     ops = _OnnxOps(network, weights)
     literal = form == "literal"
@@ -123,9 +123,9 @@ def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
         encoded["image"] = ops.node("AveragePool", [gray], kernel_shape=[2, 2], strides=[2, 2])
     if "phases" in network.inputs:
         encoded["phases"] = ops.node("SpaceToDepth", [gray], blocksize=2)
-    if "valid" in network.inputs:
-        inputs["valid"] = [1, 1, "h", "w"]
-        encoded["valid"] = ops.shift(ops.multiply("valid", 2), -1)
+    if "confidence" in network.inputs:
+        inputs["confidence"] = [1, 1, "h", "w"]
+        encoded["confidence"] = ops.shift(ops.multiply("confidence", 4), -2)
     head = network.forward(ops, encoded)["map"]
     if literal:
         full = ops.multiply(ops.shuffle(head), 256)

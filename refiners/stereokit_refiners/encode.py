@@ -37,19 +37,23 @@ def half_image(left: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def encode(
-    names: tuple[str, ...], form: str, disparity: NDArray[np.float32], valid: NDArray[np.bool_], left: NDArray[Any]
+    names: tuple[str, ...],
+    form: str,
+    disparity: NDArray[np.float32],
+    confidence: NDArray[np.float32] | None,
+    left: NDArray[Any],
 ) -> dict[str, NDArray[np.float32]]:
     """Return a network's inputs.
 
     Parameters
     ----------
     names : tuple of str
-        Which: "disparity", "image", "valid", "phases".
+        Which: "disparity", "image", "confidence", "phases".
     form : {"residual", "literal"}
     disparity : (h, w) float32
         Coarse map in full-size pixels, without NaN.
-    valid : (h, w) bool
-        Where it was measured.
+    confidence : (h, w) float32 or None
+        The matcher's confidence, 0 to 1, 0 where nothing was measured; None for networks that do not look at it.
     left : (2h, 2w) uint8 or float32
         Left image, grey levels 0 to 255.
 
@@ -68,9 +72,15 @@ def encode(
             disparity * np.float32(1 / 256) if literal else disparity * np.float32(1 / 16) - np.float32(1.5)
         ),
         "image": lambda: gray(half_image(left)),
-        "valid": lambda: valid.astype(np.float32) * np.float32(2) - np.float32(1),
+        "confidence": lambda: _given(confidence) * np.float32(4) - np.float32(2),
         "phases": lambda: np.stack([gray(left[i::2, j::2]) for i in (0, 1) for j in (0, 1)]),
     }
     return {
         name: np.ascontiguousarray(makers[name]().reshape(-1, *disparity.shape), dtype=np.float32) for name in names
     }
+
+
+def _given(confidence: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    if confidence is None:
+        raise OptionError("coarse must come with a confidence for this refiner (Matcher(confidence=True)), got none")
+    return confidence

@@ -5,7 +5,7 @@ The exported graph is the whole refiner, with scaling and upsampling inside:
 - ``coarse``, (1, 1, h, w) float32: half-size map in half-size pixels, without gaps; h and w multiples of the
   network's own (4 or 8);
 - ``left``, (1, 1, 2h, 2w) float32: grey levels 0 to 255;
-- ``valid``, (1, 1, h, w) float32, 1 where measured, for networks that look at it;
+- ``confidence``, (1, 1, h, w) float32, 0 to 1, 0 where not measured, for networks that look at it;
 - result ``disparity``, (1, 1, 2h, 2w) float32, full-size pixels.
 
 ONNX leaves h and w open. OpenVINO's IR is made from the same graph (opset 18).
@@ -100,11 +100,11 @@ def largest_difference(content: WeightFile, model: bytes) -> float:
     rows, columns = 48, 80
     coarse = np.tile(np.linspace(2, 40, columns, dtype=np.float32), (rows, 1))
     coarse[16:32, 20:50] += 8
-    valid = rng.random((rows, columns)) < 0.9
+    confidence = np.maximum(rng.random((rows, columns), np.float32) - np.float32(0.1), np.float32(0))
     left = rng.integers(0, 256, (2 * rows, 2 * columns), dtype=np.uint8)
-    refined = _reference(content, Disparity(coarse, valid), left)
+    refined = _reference(content, Disparity(coarse, confidence > 0, confidence), left)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    feeds = {"coarse": coarse, "valid": valid.astype(np.float32), "left": left.astype(np.float32)}
+    feeds = {"coarse": coarse, "confidence": confidence, "left": left.astype(np.float32)}
     given = {i.name: feeds[i.name][None, None] for i in session.get_inputs()}
     return float(np.abs(session.run(None, given)[0][0, 0] - refined).max())
 

@@ -118,6 +118,11 @@ class LearnedRefiner:
         """The frames that the weights were trained on, ``DATASET/NAME``, as far as their file says."""
         return frozenset(str(name) for name in self._file.notes.get("frames", ()))
 
+    @property
+    def needs_confidence(self) -> bool:
+        """Whether the coarse map must come with the matcher's confidence."""
+        return "confidence" in network_named(self._file.network).inputs
+
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the refined map at the size of `left`; see `stereokit_refiners.refiner.Refiner`.
 
@@ -135,9 +140,9 @@ class LearnedRefiner:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
         below, beside = -height % network.multiple, -width % network.multiple
         disparity = _extended(disparity * np.float32(2), below, beside)
-        valid = _extended(coarse.valid.view(np.uint8), below, beside).astype(bool)
+        confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
         image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
-        inputs = encode(tuple(network.inputs), self._file.form, disparity, valid, image)
+        inputs = encode(tuple(network.inputs), self._file.form, disparity, confidence, image)
         head = self._compiled.run(inputs, threads)
         full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads)
         known = _doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
@@ -145,8 +150,8 @@ class LearnedRefiner:
             missing = _doubled(unknown.view(np.uint8), rows, columns).astype(bool)
             full[missing] = np.nan
             known &= ~missing
-        confidence = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
-        return Disparity(full, known, confidence)
+        sure = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
+        return Disparity(full, known, sure)
 
 
 @dataclass(frozen=True, eq=False)

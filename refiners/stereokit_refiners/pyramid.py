@@ -8,7 +8,7 @@ copies a value from one side.
 
 The work is spent at 1/4, 1/8 and 1/16 of the full size with 3x3 kernels: a receptive field of several hundred pixels
 at the arithmetic of the paper's network. The image comes in at full size, its four phases as channels, and the map
-with the mask of what the matcher measured.
+with the matcher's confidence: the fifth of the pixels that it is least sure of has half of the errors.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Pyramid:
         Layer("merge_0", _A, _E, kernel=3),
         Layer("head", _E, 4 * len(OFFSETS) + 4 + 1, kernel=1),
     )
-    inputs: ClassVar[dict[str, int]] = {"disparity": 1, "valid": 1, "phases": 4}
+    inputs: ClassVar[dict[str, int]] = {"disparity": 1, "confidence": 1, "phases": 4}
     multiple: ClassVar[int] = 8
     forms: ClassVar[tuple[str, ...]] = ("residual",)
     latent: ClassVar[bool] = False
@@ -69,7 +69,7 @@ class Pyramid:
         def up(name: str, low: Any, skip: Any) -> Any:
             return ops.activate(f"{name}_sum", ops.add(skip, ops.twice(ops.conv(name, [low], activate=False))))
 
-        a = ops.conv("stem", [inputs["disparity"], inputs["valid"], inputs["phases"]])
+        a = ops.conv("stem", [inputs["disparity"], inputs["confidence"], inputs["phases"]])
         b = block("block_1", ops.conv("down_1", [a]))
         c = block("block_2", ops.conv("down_2", [b]))
         d = block("block_3", ops.conv("down_3", [c]))

@@ -16,7 +16,11 @@ __all__ = ["Refiner"]
 
 
 class Refiner(Protocol):
-    """Brings a half-size map to full size."""
+    """Brings a half-size map to full size.
+
+    One that looks at the matcher's confidence has an attribute ``needs_confidence`` that is True; others may leave it
+    out. `stereokit.Matcher` then gives it a coarse map with ``confidence``.
+    """
 
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the full-size map.

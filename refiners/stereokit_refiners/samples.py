@@ -10,23 +10,32 @@ from __future__ import annotations
 
 import hashlib
 import io
+import zipfile
+import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 import stereokit
-from stereokit.defaults import DEFAULTS
+from stereokit.defaults import HALF, defaults_of
+from stereokit.errors import FileError
 from stereokit.io import make_folder, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
+from stereokit_refiners.augment import Views, mirrored, moved_objects, photographed, rescaled
 
-__all__ = ["Crop", "Pair", "Sample", "crop", "load_variant", "make_variant", "whole"]
+__all__ = ["Crop", "Pair", "Sample", "Shelf", "crop", "load_variant", "make_variant", "store_variant", "whole"]
 
 _STEP = np.float32(1 / 256)  # maps are kept as KITTI keeps them
+_HERE = Path(__file__)
+_SOURCES = _HERE.read_bytes() + _HERE.with_name("augment.py").read_bytes()
+_OWN = hashlib.sha256(_SOURCES).hexdigest()[:8]  # says what made a cached sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +57,7 @@ class Pair:
     noc: NDArray[np.float32]
     occ: NDArray[np.float32]
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """A fingerprint of the content."""
         found = hashlib.sha256()
@@ -65,8 +74,8 @@ class Sample:
     ----------
     coarse : (h, w) uint16
         Coarse map in 1/256 half-size pixels, filled.
-    valid : (h, w) bool
-        Where it was measured.
+    confidence : (h, w) uint8
+        The matcher's confidence in 1/255, 0 where nothing was measured.
     left : (2h, 2w) uint8
     truth : (2h, 2w) uint16
         1/256 full-size pixels, 0 unknown.
@@ -77,7 +86,7 @@ class Sample:
     """
 
     coarse: NDArray[np.uint16]
-    valid: NDArray[np.bool_]
+    confidence: NDArray[np.uint8]
     left: NDArray[np.uint8]
     truth: NDArray[np.uint16]
     seen: NDArray[np.bool_]
@@ -92,7 +101,8 @@ class Crop:
     ----------
     disparity : (h, w) float32
         Coarse map in full-size pixels.
-    valid : (h, w) bool
+    confidence : (h, w) float32
+        0 to 1, 0 where nothing was measured.
     left : (2h, 2w) float32
         Grey levels, 0 to 255.
     truth : (2h, 2w) float32
@@ -103,7 +113,7 @@ class Crop:
     """
 
     disparity: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    confidence: NDArray[np.float32]
     left: NDArray[np.float32]
     truth: NDArray[np.float32]
     weight: NDArray[np.float32]
@@ -116,7 +126,7 @@ def _cut(sample: Sample, y: int, x: int, rows: int, columns: int) -> Crop:
     weight = np.where(truth > 0, np.where(sample.seen[large], np.float32(2), np.float32(1)), np.float32(0))
     return Crop(
         sample.coarse[small] * (np.float32(2) * _STEP),
-        sample.valid[small],
+        sample.confidence[small] * np.float32(1 / 255),
         sample.left[large].astype(np.float32),
         truth * _STEP,
         weight.astype(np.float32),
@@ -138,11 +148,11 @@ def crop(sample: Sample, rows: int, columns: int, rng: np.random.Generator) -> C
     left = np.clip((values - np.float32(128)) * np.float32(contrast) + np.float32(128 + level), 0, 255)
     more = ((0, rows - part.disparity.shape[0]), (0, columns - part.disparity.shape[1]))
     if more == ((0, 0), (0, 0)):
-        return Crop(part.disparity, part.valid, left.astype(np.float32), part.truth, part.weight)
+        return Crop(part.disparity, part.confidence, left.astype(np.float32), part.truth, part.weight)
     twice = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
-        np.pad(part.valid, more, mode="edge"),
+        np.pad(part.confidence, more, mode="edge"),
         np.pad(left, twice, mode="edge").astype(np.float32),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -157,7 +167,7 @@ def whole(sample: Sample, multiple: int) -> Crop:
     twice = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
-        np.pad(part.valid, more, mode="edge"),
+        np.pad(part.confidence, more, mode="edge"),
         np.pad(part.left, twice, mode="edge"),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -181,15 +191,17 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     -------
     Sample
     """
-    left, right, noc, occ = pair.left, pair.right, pair.noc, pair.occ
-    options: dict[str, Any] = {}
+    views = Views(pair.left, pair.right, pair.noc, pair.occ)
+    options = dict(HALF.get(parse_method(method), {}))
     if number > 0:
         rng = np.random.default_rng([seed, number, int(pair.digest[:8], 16)])
-        left, right, noc, occ = _rescaled(rng, left, right, noc, occ)
-        left, right = _photographed(rng, left, right)
-        options = _drawn_options(rng, method)
-    left, right = _even(left), _even(right)
-    matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, **options)
+        if number % 2 == 0 and np.isfinite(views.noc).any():
+            views = mirrored(views)
+        views = photographed(rng, rescaled(rng, moved_objects(rng, views)))
+        options |= _drawn_options(rng, method)
+    noc, occ = views.noc, views.occ
+    left, right = _even(views.left), _even(views.right)
+    matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, confidence=True, **options)
     found = matcher(half(left), half(right))
     height, width = left.shape
     truth = np.zeros((height, width), np.uint16)
@@ -199,7 +211,9 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     known = np.where(np.isfinite(noc), noc, occ)
     truth[:rows, :columns] = np.where(np.isfinite(known), np.clip(np.rint(known / _STEP), 1, 65535), 0)
     coarse = np.clip(np.rint(found.disparity / _STEP), 0, 65535).astype(np.uint16)
-    return Sample(coarse, found.valid, left, truth, seen, (rows, columns))
+    assert found.confidence is not None
+    confidence = np.clip(np.rint(found.confidence * 255), 0, 255).astype(np.uint8)
+    return Sample(coarse, confidence, left, truth, seen, (rows, columns))
 
 
 def half(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -212,41 +226,10 @@ def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
 
 
-def _rescaled(
-    rng: np.random.Generator, left: NDArray[Any], right: NDArray[Any], noc: NDArray[Any], occ: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return the pair at a random size; the truth's disparities follow the width."""
-    across = float(np.exp(rng.normal(0, 0.18)))
-    down = float(np.clip(across * np.exp(rng.normal(0, 0.1)), 0.6, 1.6))
-    across = float(np.clip(across, 0.6, 1.6))
-    rows, columns = left.shape
-    size = (max(64, round(columns * across)), max(64, round(rows * down)))
-    shrinks = across < 1 and down < 1
-    images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR) for i in (left, right)]
-    factor = np.float32(size[0] / columns)
-    maps = [cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT) * factor for m in (noc, occ)]
-    return images[0], images[1], maps[0], maps[1]
-
-
-def _photographed(
-    rng: np.random.Generator, left: NDArray[Any], right: NDArray[Any]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return both views under another exposure, slightly different between them, with noise."""
-    gamma, gain = float(np.exp(rng.normal(0, 0.15))), float(np.exp(rng.normal(0, 0.12)))
-    noise = float(rng.exponential(1.0))
-    views = []
-    for view in (left, right):
-        own_gain, offset = float(np.exp(rng.normal(0, 0.02))), float(rng.normal(0, 1.5))
-        curve = 255 * (np.arange(256) / 255) ** gamma * gain * own_gain + offset
-        values = curve.astype(np.float32)[view] + np.float32(noise) * rng.standard_normal(view.shape, np.float32)
-        views.append(np.clip(np.rint(values), 0, 255).astype(np.uint8))
-    return views[0], views[1]
-
-
 def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
     """Return the matcher's options, drawn around the defaults of `stereokit.defaults`."""
     name = parse_method(method)
-    base = {**DEFAULTS[""], **DEFAULTS.get(name, {})}
+    base = defaults_of(name, half=True)
     options: dict[str, Any] = {
         "smooth": float(np.clip(base["smooth"] * np.exp(rng.normal(0, 0.15)), 0.3, 1.2)),
         "speckle": float(base["speckle"] * np.exp(rng.normal(0, 0.4))),
@@ -263,25 +246,69 @@ def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
 
 def cache_name(pair: Pair, method: str, seed: int, number: int, max_disparity: int) -> str:
     """Return the file name of a variant: all that it depends on."""
-    own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
     which = f"{pair.digest}-{method.lower().replace('+', '_')}-{max_disparity}-{seed}-{number}"
-    return f"{which}-{FINGERPRINT}-{own}.npz"
+    return f"{which}-{FINGERPRINT}-{_OWN}.npz"
 
 
 def load_variant(
     pair: Pair, method: str, seed: int, number: int, max_disparity: int = 128, cache: Path | None = None
 ) -> Sample:
     """Return a variant, from the cache folder if it is there; otherwise make it and keep it."""
-    path = None if cache is None else cache / cache_name(pair, method, seed, number, max_disparity)
-    if path is not None and path.exists():
-        with np.load(path) as held:
-            return Sample(
-                held["coarse"], held["valid"], held["left"], held["truth"], held["seen"], tuple(held["size"].tolist())
-            )
-    sample = make_variant(pair, method, seed, number, max_disparity)
-    if path is not None:
+    if cache is None:
+        return make_variant(pair, method, seed, number, max_disparity)
+    return _read(store_variant(pair, method, seed, number, max_disparity, cache))
+
+
+def store_variant(pair: Pair, method: str, seed: int, number: int, max_disparity: int, cache: Path) -> Path:
+    """Return the file of a variant in the cache folder; make it if it is not there."""
+    path = cache / cache_name(pair, method, seed, number, max_disparity)
+    if not path.exists():
+        sample = make_variant(pair, method, seed, number, max_disparity)
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **{k: np.asarray(v) for k, v in vars(sample).items()})
         make_folder("cache", path.parent)
         write_bytes(path, buffer.getvalue())
-    return sample
+    return path
+
+
+def _read(path: Path) -> Sample:
+    try:
+        with path.open("rb") as file, np.load(file) as held:
+            return Sample(
+                held["coarse"],
+                held["confidence"],
+                held["left"],
+                held["truth"],
+                held["seen"],
+                tuple(held["size"].tolist()),
+            )
+    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
+        raise FileError(f"cache must hold samples of this program, cannot read {str(path)!r} ({error})") from None
+
+
+class Shelf(Sequence[Sample]):
+    """Samples in files, read each time one is asked for: as many as the disk holds, in little memory.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files of `store_variant`.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = list(paths)
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> Shelf: ...
+    def __getitem__(self, index: int | slice) -> Sample | Shelf:
+        return Shelf(self._paths[index]) if isinstance(index, slice) else _read(self._paths[index])
+
+    @property
+    def digest(self) -> int:
+        """A number that says which samples these are: their names tell all that they depend on."""
+        return zlib.crc32("/".join(path.name for path in self._paths).encode())

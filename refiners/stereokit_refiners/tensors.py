@@ -54,15 +54,15 @@ class TensorRefiner:
         self._module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._module.eval().requires_grad_(False)
 
-    def __call__(self, coarse: Any, valid: Any, left: Any) -> Tensor:
+    def __call__(self, coarse: Any, confidence: Any, left: Any) -> Tensor:
         """Return the full-size map, on the device.
 
         Parameters
         ----------
         coarse : (ceil(H/2), ceil(W/2)) float32
             Half-size map in half-size pixels, without NaN.
-        valid : (ceil(H/2), ceil(W/2)) bool
-            Where it was measured.
+        confidence : (ceil(H/2), ceil(W/2)) float32
+            The matcher's, 0 where nothing was measured.
         left : (H, W) uint8
             Grey image.
 
@@ -75,12 +75,13 @@ class TensorRefiner:
         InputError
             If the sizes do not fit one another.
         """
-        disparity, known, image = (torch.as_tensor(x, device=self.device) for x in (coarse, valid, left))
+        disparity, known, image = (torch.as_tensor(x, device=self.device) for x in (coarse, confidence, left))
         if image.ndim != 2 or disparity.shape != ((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2):
             found = f"{tuple(disparity.shape)} and {tuple(image.shape)}"
             raise InputError(f"coarse must be (H/2, W/2), rounded up, of left (H, W), got {found}")
         if known.shape != disparity.shape:
-            raise InputError(f"valid must have the shape of coarse {tuple(disparity.shape)}, got {tuple(known.shape)}")
+            wanted, found = tuple(disparity.shape), str(tuple(known.shape))
+            raise InputError(f"confidence must have the shape of coarse {wanted}, got {found}")
         rows, columns = image.shape
         height, width = disparity.shape
         below, beside = -height % self.network.multiple, -width % self.network.multiple
@@ -92,7 +93,7 @@ class TensorRefiner:
             full = compose(self.network.name, self.content.form, heads["map"], disparity)
             return full[0, 0, :rows, :columns].contiguous()
 
-    def _encoded(self, disparity: Tensor, valid: Tensor, left: Tensor) -> dict[str, Tensor]:
+    def _encoded(self, disparity: Tensor, confidence: Tensor, left: Tensor) -> dict[str, Tensor]:
         """Return the network's inputs: `stereokit_refiners.encode.encode` in torch."""
         literal = self.content.form == "literal"
         gray = left / 255 if literal else (left / 255 - 0.4) * 4
@@ -100,7 +101,7 @@ class TensorRefiner:
             "disparity": disparity / 256 if literal else disparity / 16 - 1.5,
             "image": F.avg_pool2d(gray, 2),
             "phases": F.pixel_unshuffle(gray, 2),
-            "valid": valid * 2 - 1,
+            "confidence": confidence * 4 - 2,
         }
         return {name: encoded[name] for name in self.network.inputs}
 

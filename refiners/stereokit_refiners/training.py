@@ -29,7 +29,7 @@ from stereokit_refiners._torch import Module, calibrate, compose
 from stereokit_refiners.encode import check_form, encode
 from stereokit_refiners.layers import Network, Weights
 from stereokit_refiners.losses import distance, divergence
-from stereokit_refiners.samples import Crop, Sample, crop, whole
+from stereokit_refiners.samples import Crop, Sample, Shelf, crop, whole
 from stereokit_refiners.settings import PRESETS, Settings
 
 __all__ = ["PRESETS", "History", "Settings", "Source", "bad_pixels", "calibrated", "fit", "predict", "restored"]
@@ -72,7 +72,7 @@ def _device() -> torch.device:
 def _batch(network: Network, form: str, crops: Sequence[Crop]) -> dict[str, Tensor]:
     """Return crops as tensors: the network's inputs, and ``coarse``, ``truth``, ``weight``, all (B, C, ., .)."""
     names = tuple(network.inputs)
-    encoded = [encode(names, form, c.disparity, c.valid, c.left) for c in crops]
+    encoded = [encode(names, form, c.disparity, c.confidence, c.left) for c in crops]
     arrays = {name: np.stack([inputs[name] for inputs in encoded]) for name in names}
     arrays["coarse"] = np.stack([c.disparity[None] for c in crops])
     arrays["truth"] = np.stack([c.truth[None] for c in crops])
@@ -326,6 +326,8 @@ def _described(
     """Return all that a training depends on, for the checkpoint."""
 
     def digest(samples: Sequence[Sample]) -> int:
+        if isinstance(samples, Shelf):
+            return samples.digest
         found = 0
         for sample in samples:
             for array in (sample.coarse, sample.left, sample.truth):

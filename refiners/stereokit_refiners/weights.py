@@ -29,7 +29,7 @@ __all__ = ["NETWORKS", "WeightFile", "network_named", "read", "shipped", "write"
 NETWORKS: dict[str, Network] = {network.name: network for network in (StereoVae(), NonVae(), Pyramid())}
 """Architectures by name."""
 
-_FORMAT = "stereokit-refiner/1"
+_FORMAT = "stereokit-refiner/2"
 
 
 @dataclass(frozen=True, eq=False)

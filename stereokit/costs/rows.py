@@ -83,6 +83,9 @@ class Pair:
         the nearest border pixel instead.
     threads : int
         How many threads preparation may use.
+    ranges : ((int, int), (int, int)) or None
+        Smallest and largest value of the left and of the right image, where these are windows of larger ones; None
+        where they are whole.
     """
 
     left: NDArray[Any]
@@ -92,6 +95,7 @@ class Pair:
     levels: Levels
     outside: float | None
     threads: int = 1
+    ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
 
 class Cost(Protocol):

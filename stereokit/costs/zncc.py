@@ -139,15 +139,22 @@ class Zncc:
         right_sum = workspace.array("zncc.right_sum", (height, right_width), np.int32)
         right_scale = workspace.array("zncc.right_scale", (height, right_width), np.float32)
         scales: dict[bool, tuple[int, np.float32]] = {}
+        images = {True: pair.left, False: pair.right}
 
         def measure(of_left: bool) -> None:
-            scales[of_left] = self._scale(pair.left if of_left else pair.right)
+            image = images[of_left]
+            if pair.ranges is None:
+                low, high = int(image.min()), int(image.max())
+            else:  # smoothing at the side of a window may leave the range
+                low, high = pair.ranges[0 if of_left else 1]
+                images[of_left] = np.clip(image, low, high)
+            scales[of_left] = self._scale(low, high)
 
         def centre(y0: int, y1: int, of_left: bool) -> None:
             if of_left:
-                _centre(pair.left, y0, y1, half, 1, -half, *scales[True], left)
+                _centre(images[True], y0, y1, half, 1, -half, *scales[True], left)
             else:
-                _centre(pair.right, y0, y1, half, -1, start, *scales[False], right)
+                _centre(images[False], y0, y1, half, -1, start, *scales[False], right)
 
         def summarise(k: int, y0: int, y1: int) -> None:
             work = workspace.array(f"zncc.work{k}", (4, right_width + 2 * half), np.int32)
@@ -188,9 +195,8 @@ class Zncc:
             )
         return producers
 
-    def _scale(self, image: NDArray[Any]) -> tuple[int, np.float32]:
-        """Return the middle of the image's range and the factor that brings it into `range_max`, 1 at most."""
-        low, high = int(image.min()), int(image.max())
+    def _scale(self, low: int, high: int) -> tuple[int, np.float32]:
+        """Return the middle of a range and the factor that brings it into `range_max`, 1 at most."""
         factor = np.float32(min(1.0, self.range_max / max(high - low, 1)))
         return (low + high) // 2, factor  # whole, or every pixel would be rounded from a half
 

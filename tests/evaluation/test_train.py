@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -125,10 +126,11 @@ def test_the_folder_and_the_report(root, tmp_path, trainable):
     assert "S2" in result.output and f"{100 * bad / known:.2f}" in result.output
 
 
-def test_the_score_is_that_of_the_written_weights_in_a_matcher(root, tmp_path, trainable):
+@pytest.mark.parametrize("refiner", ["cnn", "stereokit"])
+def test_the_score_is_that_of_the_written_weights_in_a_matcher(root, tmp_path, trainable, refiner):
     """What is reported is what `stereokit.Matcher` with the written file does on the held-out frames."""
     out, report = tmp_path / "out", tmp_path / "report.json"
-    trained(root, out, "--frames", "0-2", "--validation", "3-4", "--json", report)
+    trained(root, out, "--frames", "0-2", "--validation", "3-4", "--json", report, refiner=refiner)
     matcher = stereokit.Matcher("S2", max_disparity=32, scale=0.5, refiner=str(out / "weights.safetensors"),
                                 precision="fp32")  # fmt: skip
     bad = 0
@@ -161,6 +163,27 @@ def test_the_cache_can_lie_elsewhere_and_changes_nothing(root, tmp_path, trainab
     trained(root, tmp_path / "two", "--frames", "0-1", "--cache", cache)
     assert_same_weights(tmp_path / "one", tmp_path / "two")
     assert not (tmp_path / "one" / "cache").exists()
+
+
+def test_a_cache_that_was_removed_is_made_again(root, tmp_path, trainable):
+    out = tmp_path / "out"
+    trained(root, out, "--frames", "0-1")
+    kept, names = weights_of(out), sorted(p.name for p in (out / "cache").iterdir())
+    shutil.rmtree(out / "cache")
+    trained(root, out, "--frames", "0-1")
+    assert weights_of(out).fingerprint == kept.fingerprint
+    assert sorted(p.name for p in (out / "cache").iterdir()) == names
+
+
+def test_a_broken_sample_in_the_cache_ends_with_one_line(root, tmp_path, trainable):
+    cache, out = tmp_path / "maps", tmp_path / "two"
+    trained(root, tmp_path / "one", "--frames", "0-1", "--cache", cache)
+    broken = sorted(cache.iterdir())[0]
+    broken.write_text("no sample")
+    data = ["--dataset", "folder", "--root", root, "--frames", "0-1", "--cache", cache]
+    failed(run("-o", out, "--refiner", "cnn", *data, *FAST, *SETTINGS), "cache must hold samples", broken.name)
+    assert not (out / "weights.safetensors").exists()
+    assert broken.read_text() == "no sample"
 
 
 def test_start_weights_are_noted_and_used(root, tmp_path, trainable):
@@ -206,6 +229,7 @@ def recorded(monkeypatch, trainable):
                 held_out=frames(validation),
                 folder=checkpoint.parent,
                 sources=sources,
+                looked_at=validation,
             )
         )
         checkpoint.parent.mkdir(exist_ok=True)
@@ -244,6 +268,15 @@ def test_validation_frames_are_never_trained_on(root, tmp_path, recorded):
     trained(root, tmp_path / "out", "--validation", "1,3")
     assert recorded[0].trained == [[0, 2, 4]]
     assert recorded[0].held_out == [1, 3]
+
+
+def test_samples_stay_on_the_disk_until_they_are_drawn(root, tmp_path, recorded, monkeypatch):
+    from stereokit_refiners.samples import Shelf
+
+    monkeypatch.setattr(training_pairs, "generate", small_scene)
+    trained(root, tmp_path / "out", "--frames", "0-1", "--validation", "2", "--streets", "1")
+    (call,) = recorded
+    assert all(isinstance(source.samples, Shelf) for source in call.sources) and isinstance(call.looked_at, Shelf)
 
 
 def test_every_matcher_and_variant_is_there(root, tmp_path, recorded):

@@ -63,6 +63,12 @@ def coarse_of(size, seed=0, gaps=0.0, low=2.0, high=30.0):
     return Disparity(disparity, valid, np.where(valid, rng.random(shape), 0).astype(np.float32))
 
 
+def sure(disparity, valid=None):
+    """Return a map of which all that is valid, or all of it, was measured with full confidence."""
+    valid = np.ones(disparity.shape, bool) if valid is None else valid
+    return Disparity(disparity, valid, valid.astype(np.float32))
+
+
 def image_of(size, seed=0):
     return np.random.default_rng([seed, 7]).integers(0, 256, size).astype(np.uint8)
 

@@ -19,6 +19,7 @@ from refining import (
     needs_backend,
     one_line,
     random_content,
+    sure,
     weight_file,
 )
 
@@ -65,7 +66,35 @@ def test_shapes_types_and_untouched_inputs(refiner, size):
     for mine in (fine.disparity, fine.valid, fine.confidence):
         for theirs in (coarse.disparity, coarse.valid, coarse.confidence, left):
             assert not np.shares_memory(mine, theirs)
-    assert refiner(Disparity(coarse.disparity, coarse.valid), left).confidence is None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_refiners_say_whether_they_need_a_confidence(name):
+    refiner = LearnedRefiner.of(random_content(name))
+    assert refiner.needs_confidence is ("confidence" in NETWORKS[name].inputs)
+    assert refiner.needs_confidence is (name == "stereokit")
+
+
+def test_a_map_without_confidence_is_refined_without_or_refused(refiner):
+    coarse, left = coarse_of((18, 30)), image_of((18, 30))
+    bare = Disparity(coarse.disparity, coarse.valid)
+    if not refiner.needs_confidence:
+        fine = refiner(bare, left)
+        assert fine.confidence is None
+        np.testing.assert_array_equal(fine.disparity, refiner(coarse, left).disparity)
+        return
+    with pytest.raises(OptionError) as caught:
+        refiner(bare, left)
+    rule = "coarse must come with a confidence for this refiner (Matcher(confidence=True)), got none"
+    assert one_line(caught.value) == rule
+
+
+def test_the_confidence_decides_where_it_is_looked_at_and_nowhere_else(exact):
+    coarse, left = coarse_of((32, 48)), image_of((32, 48))
+    doubted = coarse.confidence.copy()
+    doubted[4:8, 4:8] = 1 - doubted[4:8, 4:8]
+    moved = exact(Disparity(coarse.disparity, coarse.valid, doubted), left).disparity != exact(coarse, left).disparity
+    assert moved.any() == exact.needs_confidence
 
 
 @pytest.mark.parametrize("size", [(33, 47), (1, 9)])
@@ -114,6 +143,7 @@ def test_odd_sizes_are_the_image_extended_by_hand_and_cut(exact, size):
     by_hand = Disparity(
         np.pad(coarse.disparity, ((0, below), (0, beside)), mode="edge"),
         np.pad(coarse.valid, ((0, below), (0, beside)), mode="edge"),
+        np.pad(coarse.confidence, ((0, below), (0, beside)), mode="edge"),
     )
     whole = 2 * (height + below), 2 * (width + beside)
     extended = np.pad(left, ((0, whole[0] - rows), (0, whole[1] - columns)), mode="edge")
@@ -132,7 +162,8 @@ def test_gaps_stay_gaps_and_the_network_sees_them_filled(exact):
     np.testing.assert_array_equal(np.isnan(fine.disparity), gap)
     np.testing.assert_array_equal(fine.valid, coarse.valid[y // 2, x // 2])
     np.testing.assert_array_equal(fine.confidence, coarse.confidence[y // 2, x // 2])
-    dense = Disparity(oracles.fill(coarse.disparity, "nearest").astype(np.float32), coarse.valid)
+    filled = oracles.fill(coarse.disparity, "nearest").astype(np.float32)
+    dense = Disparity(filled, coarse.valid, coarse.confidence)
     np.testing.assert_array_equal(exact(dense, left).disparity[~gap], fine.disparity[~gap])
 
 
@@ -140,13 +171,13 @@ def test_a_pixel_called_valid_that_is_a_gap_is_not_valid(exact):
     coarse = coarse_of((16, 16))
     disparity = coarse.disparity.copy()
     disparity[3, 4] = NAN
-    fine = exact(Disparity(disparity, np.ones((8, 8), bool)), image_of((16, 16)))
+    fine = exact(sure(disparity), image_of((16, 16)))
     assert not fine.valid[6:8, 8:10].any()
     assert fine.valid.sum() == 16 * 16 - 4
 
 
 def test_a_map_of_gaps_only_stays_one(exact):
-    nothing = Disparity(np.full((8, 8), NAN, np.float32), np.zeros((8, 8), bool))
+    nothing = sure(np.full((8, 8), NAN, np.float32), np.zeros((8, 8), bool))
     fine = exact(nothing, image_of((16, 16)))
     assert np.isnan(fine.disparity).all()
     assert not fine.valid.any()
@@ -155,7 +186,7 @@ def test_a_map_of_gaps_only_stays_one(exact):
 @pytest.mark.parametrize("value", [-37.5, 0.0, 1000.0])
 def test_far_negative_and_huge_disparities_are_finite_and_follow(exact, value):
     size = (16, 24)
-    flat = Disparity(np.full(half_of(size), value, np.float32), np.ones(half_of(size), bool))
+    flat = sure(np.full(half_of(size), value, np.float32))
     fine = exact(flat, np.full(size, 100, np.uint8))
     assert np.isfinite(fine.disparity).all()
 
@@ -167,7 +198,7 @@ def test_a_network_that_says_nothing_leaves_a_flat_map_as_it_is(name, value):
     last = NETWORKS[name].layers[-1].name
     content.arrays[f"{last}.bias"][:] = 0
     refiner = LearnedRefiner.of(content, precision="fp32")
-    flat = Disparity(np.full((8, 12), value, np.float32), np.ones((8, 12), bool))
+    flat = sure(np.full((8, 12), value, np.float32))
     np.testing.assert_allclose(refiner(flat, image_of((16, 24))).disparity, 2 * value, rtol=1e-5)
 
 

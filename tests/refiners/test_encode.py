@@ -5,18 +5,21 @@ from __future__ import annotations
 import numpy as np
 import oracles
 import pytest
+from refining import one_line
 
 from stereokit.errors import OptionError
 from stereokit_refiners.encode import FORMS, check_form, encode, half_image
 
-ALL = ("disparity", "image", "valid", "phases")
+ALL = ("disparity", "image", "confidence", "phases")
 
 
 def given(rows, columns, dtype=np.uint8, seed=0):
     rng = np.random.default_rng(seed)
     disparity = (rng.random((rows, columns)) * 90 - 10).astype(np.float32)
     left = rng.integers(0, 256, (2 * rows, 2 * columns)).astype(dtype)
-    return disparity, rng.random((rows, columns)) < 0.5, left
+    confidence = rng.random((rows, columns), np.float32)
+    confidence[rng.random((rows, columns)) < 0.3] = 0
+    return disparity, confidence, left
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
@@ -24,9 +27,9 @@ def given(rows, columns, dtype=np.uint8, seed=0):
 @pytest.mark.parametrize("form", FORMS)
 def test_every_input_against_its_formula(form, size, dtype):
     rows, columns = size
-    disparity, valid, left = given(rows, columns, dtype)
-    kept = disparity.copy(), valid.copy(), left.copy()
-    found = encode(ALL, form, disparity, valid, left)
+    disparity, confidence, left = given(rows, columns, dtype)
+    kept = disparity.copy(), confidence.copy(), left.copy()
+    found = encode(ALL, form, disparity, confidence, left)
     assert list(found) == list(ALL)
     gray = (lambda v: v / 255) if form == "literal" else (lambda v: 4 * (v / 255 - 0.4))
     for y in range(rows):
@@ -35,22 +38,42 @@ def test_every_input_against_its_formula(form, size, dtype):
             assert found["disparity"][0, y, x] == pytest.approx(
                 d / 256 if form == "literal" else d / 16 - 1.5, abs=1e-6
             )
-            assert found["valid"][0, y, x] == (1 if valid[y, x] else -1)
+            assert found["confidence"][0, y, x] == pytest.approx(4 * float(confidence[y, x]) - 2, abs=1e-6)
             four = [float(left[2 * y + i, 2 * x + j]) for i in (0, 1) for j in (0, 1)]
             assert found["image"][0, y, x] == pytest.approx(gray(sum(four) / 4), abs=2e-6)
             for k in range(4):
                 assert found["phases"][k, y, x] == pytest.approx(gray(four[k]), abs=2e-6)
-    for name, channels in {"disparity": 1, "image": 1, "valid": 1, "phases": 4}.items():
+    for name, channels in {"disparity": 1, "image": 1, "confidence": 1, "phases": 4}.items():
         assert found[name].shape == (channels, rows, columns)
         assert found[name].dtype == np.float32
         assert found[name].flags.c_contiguous
-    for before, after in zip(kept, (disparity, valid, left), strict=True):
+    for before, after in zip(kept, (disparity, confidence, left), strict=True):
         np.testing.assert_array_equal(before, after)
 
 
 def test_only_what_is_asked_for_is_made():
-    disparity, valid, left = given(4, 4)
-    assert list(encode(("valid", "disparity"), "residual", disparity, valid, left)) == ["valid", "disparity"]
+    disparity, confidence, left = given(4, 4)
+    names = ("confidence", "disparity")
+    assert list(encode(names, "residual", disparity, confidence, left)) == list(names)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_was_not_measured_is_minus_2_and_what_is_certain_2(form):
+    confidence = np.float32([[0, 0.5, 1]])
+    found = encode(("confidence",), form, np.zeros((1, 3), np.float32), confidence, np.zeros((2, 6), np.uint8))
+    np.testing.assert_array_equal(found["confidence"], [[[-2, 0, 2]]])
+
+
+def test_no_confidence_is_refused_only_where_it_is_looked_at():
+    disparity, confidence, left = given(4, 4)
+    names = ("disparity", "image", "phases")
+    without, beside = (encode(names, "residual", disparity, c, left) for c in (None, confidence))
+    for name in names:
+        np.testing.assert_array_equal(without[name], beside[name])
+    with pytest.raises(OptionError) as caught:
+        encode(ALL, "residual", disparity, None, left)
+    rule = "coarse must come with a confidence for this refiner (Matcher(confidence=True)), got none"
+    assert one_line(caught.value) == rule
 
 
 def test_half_image_is_the_mean_of_four_without_rounding():
@@ -62,10 +85,10 @@ def test_half_image_is_the_mean_of_four_without_rounding():
 
 
 def test_strided_images_are_read_where_they_are():
-    disparity, valid, left = given(4, 6)
+    disparity, confidence, left = given(4, 6)
     wide = np.zeros((8, 24), np.uint8)
     wide[:, ::2] = left
-    plain, strided = (encode(ALL, "residual", disparity, valid, image) for image in (left, wide[:, ::2]))
+    plain, strided = (encode(ALL, "residual", disparity, confidence, image) for image in (left, wide[:, ::2]))
     for name in ALL:
         np.testing.assert_array_equal(plain[name], strided[name])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -39,9 +40,9 @@ def failed(result, *parts):
 
 def feeds(content, size):
     coarse, left = coarse_of(size, 4), image_of(size, 4)
-    given = {"coarse": coarse.disparity, "left": left.astype(np.float32), "valid": coarse.valid.astype(np.float32)}
-    if "valid" not in NETWORKS[content.network].inputs:
-        del given["valid"]
+    given = {"coarse": coarse.disparity, "left": left.astype(np.float32), "confidence": coarse.confidence}
+    if "confidence" not in NETWORKS[content.network].inputs:
+        del given["confidence"]
     refined = LearnedRefiner.of(content, precision="fp32")(coarse, left).disparity
     return {name: array[None, None] for name, array in given.items()}, refined
 
@@ -215,8 +216,8 @@ def test_the_difference_is_that_of_the_maps():
     assert module.largest_difference(random_content("cnn", seed=1), model) > module.TOLERANCE_PX
 
 
-def test_exported_graphs_take_maps_without_gaps_only_as_documented(tmp_path):
-    """The head of the pyramid sees the mask: another mask is another map."""
+def test_exported_graphs_take_maps_without_gaps_only_as_documented():
+    """The pyramid sees the confidence: another confidence is another map."""
     import onnxruntime
 
     content = random_content("stereokit")
@@ -224,9 +225,13 @@ def test_exported_graphs_take_maps_without_gaps_only_as_documented(tmp_path):
     size = (32, 32)
     coarse, left = coarse_of(size), image_of(size)
     maps = []
-    for valid in (np.ones(half_of(size), bool), np.zeros(half_of(size), bool)):
-        given = {"coarse": coarse.disparity, "valid": valid.astype(np.float32), "left": left.astype(np.float32)}
+    for level in (1, 0.4, 0):
+        confidence = np.full(half_of(size), level, np.float32)
+        given = {"coarse": coarse.disparity, "confidence": confidence, "left": left.astype(np.float32)}
         maps.append(session.run(None, {k: v[None, None] for k, v in given.items()})[0][0, 0])
-        refined = LearnedRefiner.of(content, precision="fp32")(Disparity(coarse.disparity, valid), left)
+        refined = LearnedRefiner.of(content, precision="fp32")(
+            Disparity(coarse.disparity, confidence > 0, confidence), left
+        )
         np.testing.assert_allclose(maps[-1], refined.disparity, rtol=0, atol=module.TOLERANCE_PX)
-    assert np.abs(maps[0] - maps[1]).max() > 0.01
+    for one, other in itertools.combinations(maps, 2):
+        assert np.abs(one - other).max() > 0.01

@@ -158,7 +158,7 @@ def stereovae_by_loops(arrays, x0, x1, latent):
     return deconv("Y", d, x0, fe_1, fe_2, activate=False), mean, log_sigma
 
 
-def pyramid_by_loops(arrays, disparity, valid, phases):
+def pyramid_by_loops(arrays, disparity, confidence, phases):
     def conv(name, *inputs, stride=1, activate=True):
         y = oracles.convolve(np.concatenate(inputs), arrays[f"{name}.weight"], arrays[f"{name}.bias"], stride)
         return oracles.leaky(y) if activate else y
@@ -171,7 +171,7 @@ def pyramid_by_loops(arrays, disparity, valid, phases):
         _, height, width = low.shape
         return oracles.leaky(skip + np.stack([oracles.double(plane, 2 * height, 2 * width) for plane in low]))
 
-    a = conv("stem", disparity, valid, phases)
+    a = conv("stem", disparity, confidence, phases)
     b = block("block_1", conv("down_1", a, stride=2))
     c = block("block_2", conv("down_2", b, stride=2))
     d = block("block_3", conv("down_3", c, stride=2))
@@ -215,7 +215,7 @@ def test_the_pyramid_is_what_loops_compute():
     arrays, inputs = random_arrays("stereokit", 2, last=1.0), encoded_of("stereokit", 8, 16)
     heads = heads_of(module_of("stereokit", arrays), inputs)
     assert list(heads) == ["map"]
-    close(heads["map"], pyramid_by_loops(arrays, *(inputs[n] for n in ("disparity", "valid", "phases"))))
+    close(heads["map"], pyramid_by_loops(arrays, *(inputs[n] for n in ("disparity", "confidence", "phases"))))
 
 
 def test_the_latent_is_its_mean_at_inference_and_drawn_in_training():

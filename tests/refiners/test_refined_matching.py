@@ -76,6 +76,20 @@ def test_the_refiner_sees_the_half_size_map_and_the_full_size_image(pair, path):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_a_matcher_gives_the_confidence_and_keeps_it_back_unless_asked(pair, tmp_path, name):
+    path, keeping = weight_file(tmp_path, name), Keeping()
+    matcher(refiner=keeping, confidence=True)(*pair)
+    expected = LearnedRefiner(path)(keeping.coarse, pair[0])
+    plain, asked = (matcher(refiner=path, confidence=confidence)(*pair) for confidence in (False, True))
+    for found in (plain, asked):
+        np.testing.assert_array_equal(found.disparity, expected.disparity)
+        np.testing.assert_array_equal(found.valid, expected.valid)
+    assert plain.confidence is None
+    np.testing.assert_array_equal(asked.confidence, expected.confidence)
+    assert [r.confidence for r in matcher(refiner=path, threads=2).map([pair] * 3)] == [None] * 3
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_shipped_refiners_by_name(pair, name):
     try:
         shipped(name)

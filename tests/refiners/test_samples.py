@@ -10,9 +10,10 @@ import pytest
 
 import stereokit
 from stereokit_refiners import samples
-from stereokit_refiners.samples import Pair, Sample, cache_name, crop, half, load_variant, make_variant, whole
+from stereokit_refiners.samples import Pair, Sample, crop, half, make_variant, whole
 
 NAN = np.nan
+FIELDS = ("disparity", "confidence", "left", "truth", "weight")
 
 
 def pair_of(size=(72, 120), shift=10, seed=0):
@@ -24,7 +25,7 @@ def pair_of(size=(72, 120), shift=10, seed=0):
     occ = np.full(size, shift, np.float32)
     occ[: size[0] // 4] = NAN
     noc = occ.copy()
-    noc[:, : size[1] // 5] = NAN
+    noc[:, : size[1] // 6] = NAN  # dense enough to be no map of objects
     return Pair("frame", left, right, noc, occ)
 
 
@@ -64,11 +65,14 @@ class Keeping:
 def test_variant_0_is_what_a_half_size_matcher_computes_inside(method, levels, size):
     pair = pair_of(size)
     keeping = Keeping()
-    stereokit.Matcher(method, max_disparity=levels, scale=0.5, refiner=keeping)(pair.left, pair.right)
+    options = {"max_disparity": levels, "scale": 0.5, "refiner": keeping, "confidence": True}
+    stereokit.Matcher(method, **options)(pair.left, pair.right)
     found = make_variant(pair, method, 0, 0, levels)
     expected = np.clip(np.rint(keeping.coarse.disparity * 256), 0, 65535).astype(np.uint16)
     np.testing.assert_array_equal(found.coarse, expected)
-    np.testing.assert_array_equal(found.valid, keeping.coarse.valid)
+    assert found.confidence.dtype == np.uint8
+    np.testing.assert_array_equal(found.confidence, np.rint(keeping.coarse.confidence * 255))
+    assert (found.confidence[~keeping.coarse.valid] == 0).all() and len(np.unique(found.confidence)) > 20
     assert found.size == size
     np.testing.assert_array_equal(found.left[: size[0], : size[1]], pair.left)
 
@@ -121,7 +125,8 @@ def test_rescaling_scales_the_truth_with_the_width(pair):
         assert 64 <= columns <= round(120 * 1.6) and 64 <= rows <= round(72 * 1.6)
         known = found.truth[:rows, :columns]
         np.testing.assert_allclose(known[known > 0] / 256, 10 * columns / 120, atol=1 / 256)
-        assert abs((known > 0).mean() - 0.75) < 0.05
+        share = 0.75 if number % 2 else 0.75 * 100 / 120  # mirrored, what both cameras see
+        assert abs((known > 0).mean() - share) < 0.05
     assert len(widths) > 4
 
 
@@ -131,6 +136,26 @@ def test_the_coarse_map_of_a_variant_still_fits_its_truth(pair):
         columns = found.size[1]
         inner = found.coarse[:, 14:-4] / 128  # beyond what is hidden by the border
         assert np.mean(np.abs(inner - 10 * columns / 120) < 1.5) > 0.9
+
+
+def test_every_other_variant_is_of_the_mirrored_pair_and_all_but_0_are_changed_before_matching(pair, monkeypatch):
+    steps, calls = ("mirrored", "moved_objects", "rescaled", "photographed"), []
+
+    def spied(name):
+        real = getattr(samples, name)
+
+        def step(*given):
+            calls.append(name)
+            return real(*given)
+
+        return step
+
+    for name in steps:
+        monkeypatch.setattr(samples, name, spied(name))
+    for number in range(5):
+        calls.clear()
+        make_variant(pair, "S2", 0, number, 32)
+        assert calls == ([] if number == 0 else list(steps[number % 2 :]))
 
 
 def test_the_pair_is_not_modified(pair):
@@ -161,32 +186,6 @@ def test_half_is_the_mean_of_four():
     np.testing.assert_array_equal(half(image), image.reshape(3, 2, 4, 2).mean(axis=(1, 3)))
 
 
-# --- the cache -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_what_is_cached_is_what_was_made(pair, number, tmp_path, monkeypatch):
-    folder = tmp_path / "not" / "there"
-    made = load_variant(pair, "S2", 0, number, 32, folder)
-    assert_same(made, load_variant(pair, "S2", 0, number, 32))
-    assert [p.name for p in folder.iterdir()] == [cache_name(pair, "S2", 0, number, 32)]
-    monkeypatch.setattr(samples, "make_variant", None)  # from here on only the cache can answer
-    assert_same(load_variant(pair, "S2", 0, number, 32, folder), made)
-
-
-def test_names_in_the_cache_say_what_decides(pair):
-    name = cache_name(pair, "S2", 0, 1, 32)
-    assert name == cache_name(pair, "s2", 0, 1, 32)
-    others = [
-        cache_name(pair_of(seed=1), "S2", 0, 1, 32),
-        cache_name(pair, "S4", 0, 1, 32),
-        cache_name(pair, "S2", 1, 1, 32),
-        cache_name(pair, "S2", 0, 2, 32),
-        cache_name(pair, "S2", 0, 1, 64),
-    ]
-    assert len({name, *others}) == 6
-
-
 # --- crops ---------------------------------------------------------------------------------------------------------
 
 
@@ -210,7 +209,8 @@ def numbered(rows, columns):
     coarse = (256 * y + x + 1).astype(np.uint16)
     truth = (128 * large_y + large_x + 1).astype(np.uint16)
     left = ((large_y + large_x) % 200 + 20).astype(np.uint8)
-    return Sample(coarse, coarse % 3 > 0, left, truth, truth % 5 > 0, (2 * rows, 2 * columns))
+    confidence = (coarse * 37 % 256).astype(np.uint8)
+    return Sample(coarse, confidence, left, truth, truth % 5 > 0, (2 * rows, 2 * columns))
 
 
 def test_crops_keep_map_truth_and_mask_together():
@@ -222,7 +222,7 @@ def test_crops_keep_map_truth_and_mask_together():
         y, x = (value - 1) // 256, (value - 1) % 256
         places.add((y, x))
         np.testing.assert_array_equal(part.disparity, sample.coarse[y : y + 8, x : x + 16] / 128)
-        np.testing.assert_array_equal(part.valid, sample.valid[y : y + 8, x : x + 16])
+        np.testing.assert_allclose(part.confidence, sample.confidence[y : y + 8, x : x + 16] / 255, rtol=1e-6)
         large = np.s_[2 * y : 2 * y + 16, 2 * x : 2 * x + 32]
         np.testing.assert_array_equal(part.truth, sample.truth[large] / 256)
         np.testing.assert_array_equal(part.weight, np.where(sample.seen[large], 2, 1))
@@ -250,23 +250,23 @@ def test_crops_change_the_exposure_only_and_by_a_rising_curve():
 def test_the_same_random_state_is_the_same_crop():
     sample = numbered(20, 30)
     one, other = (crop(sample, 8, 8, np.random.default_rng(3)) for _ in range(2))
-    for name in ("disparity", "valid", "left", "truth", "weight"):
+    for name in FIELDS:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 def test_small_samples_are_extended_without_weight():
     sample = numbered(5, 20)
     part = crop(sample, 8, 24, np.random.default_rng(0))
-    assert part.disparity.shape == part.valid.shape == (8, 24)
+    assert part.disparity.shape == part.confidence.shape == (8, 24)
     assert part.left.shape == part.truth.shape == part.weight.shape == (16, 48)
     assert (part.weight[:10, :40] > 0).all()
     assert (part.weight[10:] == 0).all() and (part.weight[:, 40:] == 0).all()
     assert (part.truth[10:] == 0).all()
-    np.testing.assert_array_equal(part.valid[5:, :20], np.tile(part.valid[4, :20], (3, 1)))
-    np.testing.assert_array_equal(part.valid[:5, 20:], np.tile(part.valid[:5, 19:20], (1, 4)))
+    np.testing.assert_array_equal(part.confidence[5:, :20], np.tile(part.confidence[4, :20], (3, 1)))
+    np.testing.assert_array_equal(part.confidence[:5, 20:], np.tile(part.confidence[:5, 19:20], (1, 4)))
     np.testing.assert_array_equal(part.disparity[:5, :20], sample.coarse / 128)
     np.testing.assert_array_equal(part.disparity[5:, :20], np.tile(part.disparity[4, :20], (3, 1)))
-    assert all(getattr(part, name).dtype == np.float32 for name in ("disparity", "left", "truth", "weight"))
+    assert all(getattr(part, name).dtype == np.float32 for name in FIELDS)
     taller = crop(numbered(20, 5), 8, 8, np.random.default_rng(1))
     assert taller.disparity.shape == (8, 8)
 
@@ -281,5 +281,7 @@ def test_whole_is_everything_on_a_multiple(size, multiple, expected):
     assert part.disparity.shape == expected
     assert part.left.shape == part.weight.shape == (2 * expected[0], 2 * expected[1])
     np.testing.assert_array_equal(part.disparity[:rows, :columns], sample.coarse / 128)
+    np.testing.assert_allclose(part.confidence[:rows, :columns], sample.confidence / 255, rtol=1e-6)
+    assert part.confidence.shape == expected and part.confidence.dtype == np.float32
     np.testing.assert_array_equal(part.left[: 2 * rows, : 2 * columns], sample.left)
     assert part.weight[2 * rows :].sum() == 0 and part.weight[:, 2 * columns :].sum() == 0

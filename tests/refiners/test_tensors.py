@@ -33,20 +33,20 @@ def test_tensors_give_what_arrays_give(name, form, size, device):
     content, coarse, left = random_content(name, form=form), coarse_of(size), image_of(size)
     expected = LearnedRefiner.of(content, backend="torch")(coarse, left).disparity
     refiner = TensorRefiner(content, device)
-    given = [torch.from_numpy(array).to(device) for array in (coarse.disparity, coarse.valid, left)]
+    given = [torch.from_numpy(array).to(device) for array in (coarse.disparity, coarse.confidence, left)]
     kept = [tensor.clone() for tensor in given]
     found = refiner(*given)
     assert found.shape == size and found.dtype == torch.float32 and found.is_contiguous()
     assert found.device.type == device
     np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=TOLERANCE_PX)
     assert all(torch.equal(a, b) for a, b in zip(given, kept, strict=True))
-    again = refiner(coarse.disparity, coarse.valid, left)  # arrays of the host are taken too
+    again = refiner(coarse.disparity, coarse.confidence, left)  # arrays of the host are taken too
     assert torch.equal(again, found)
 
 
 def test_a_file_is_taken_by_its_path(tmp_path):
     path = weight_file(tmp_path, "cnn")
-    given = coarse_of((16, 16)).disparity, coarse_of((16, 16)).valid, image_of((16, 16))
+    given = coarse_of((16, 16)).disparity, coarse_of((16, 16)).confidence, image_of((16, 16))
     assert torch.equal(TensorRefiner(path, "cpu")(*given), TensorRefiner(random_content("cnn"), "cpu")(*given))
     with pytest.raises(FileError, match="weights must name a file"):
         TensorRefiner(str(tmp_path / "none.safetensors"), "cpu")
@@ -63,12 +63,12 @@ def test_devices_that_torch_lacks_are_refused():
 
 def test_sizes_that_do_not_fit_are_refused():
     refiner = TensorRefiner(random_content("cnn"), "cpu")
-    coarse, valid, left = torch.zeros(8, 8), torch.ones(8, 8, dtype=torch.bool), torch.zeros(16, 16, dtype=torch.uint8)
+    coarse, confidence, left = torch.zeros(8, 8), torch.ones(8, 8), torch.zeros(16, 16, dtype=torch.uint8)
     for given in (
-        (coarse[:7], valid, left),
-        (coarse, valid, left[None]),
-        (coarse, valid[:7], left),
-        (left, valid, left),
+        (coarse[:7], confidence, left),
+        (coarse, confidence, left[None]),
+        (coarse, confidence[:7], left),
+        (left, confidence, left),
     ):
         with pytest.raises(InputError) as caught:
             refiner(*given)

@@ -44,7 +44,15 @@ def sample_of(seed=0, size=(24, 40), offset=6.0, known=0.8):
     left[size[0] :] = left[size[0] - 1]
     left[:, size[1] :] = left[:, size[1] - 1 : size[1]]
     seen = (truth > 0) & (rng.random(truth.shape) < 0.9)
-    return Sample(coarse, rng.random((rows, columns)) < 0.9, left, truth.astype(np.uint16), seen, size)
+    confidence = rng.integers(0, 256, (rows, columns)).astype(np.uint8)
+    confidence[rng.random((rows, columns)) > 0.9] = 0
+    return Sample(coarse, confidence, left, truth.astype(np.uint16), seen, size)
+
+
+def coarse_map(sample):
+    """Return what a matcher gave for a sample, before it was packed."""
+    confidence = sample.confidence.astype(np.float32) / 255
+    return Disparity(sample.coarse.astype(np.float32) / 256, confidence > 0, confidence)
 
 
 SAMPLES = [sample_of(seed) for seed in range(3)]
@@ -147,7 +155,7 @@ def test_bad_pixels_are_those_of_kitti(occluded):
 def test_exactly_3_pixels_and_exactly_5_percent_are_good():
     def counts(true, error):
         truth = np.full((2, 2), round(true * 256), np.uint16)
-        one = Sample(np.zeros((1, 1), np.uint16), np.ones((1, 1), bool), np.zeros((2, 2), np.uint8), truth,
+        one = Sample(np.zeros((1, 1), np.uint16), np.full((1, 1), 255, np.uint8), np.zeros((2, 2), np.uint8), truth,
                      np.ones((2, 2), bool), (2, 2))  # fmt: skip
         return bad_pixels(np.full((2, 2), true + error, np.float32), one)
 
@@ -168,7 +176,7 @@ def test_predict_is_what_the_refiner_computes(name, form, size):
     assert found.shape == size
     assert found.dtype == np.float32
     refiner = LearnedRefiner.of(WeightFile(name, form, arrays), backend="torch")
-    coarse = Disparity(sample.coarse.astype(np.float32) / 256, sample.valid)
+    coarse = coarse_map(sample)
     image = np.ascontiguousarray(sample.left[: size[0], : size[1]])
     np.testing.assert_allclose(found, refiner(coarse, image).disparity, rtol=0, atol=2e-3)
 
@@ -196,7 +204,7 @@ def test_batches_are_functions_of_seed_step_and_rank():
 
     first = draw(5)
     assert {k: tuple(v.shape) for k, v in first.items()} == {
-        "disparity": (2, 1, 8, 16), "valid": (2, 1, 8, 16), "phases": (2, 4, 8, 16), "coarse": (2, 1, 8, 16),
+        "disparity": (2, 1, 8, 16), "confidence": (2, 1, 8, 16), "phases": (2, 4, 8, 16), "coarse": (2, 1, 8, 16),
         "truth": (2, 1, 16, 32), "weight": (2, 1, 16, 32),
     }  # fmt: skip
     for name, tensor in draw(5).items():
@@ -469,7 +477,7 @@ def test_calibration_after_training_gives_int8():
     ranges = training.calibrated(training.restored(NETWORKS["stereovae"], arrays), "residual", SOURCES)
     content = WeightFile("stereovae", "residual", arrays, ranges)
     sample = SAMPLES[0]
-    coarse = Disparity(sample.coarse.astype(np.float32) / 256, sample.valid)
+    coarse = coarse_map(sample)
     exact, rough = (
         LearnedRefiner.of(content, backend="openvino", precision=p)(coarse, sample.left).disparity
         for p in ("fp32", "int8")

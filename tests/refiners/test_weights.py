@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from refining import NAMES, one_line, random_arrays, random_content
 
+import stereokit
 from stereokit.errors import FileError, StereokitError
 from stereokit_refiners.weights import NETWORKS, WeightFile, network_named, read, shipped, write
 
 safetensors_numpy = pytest.importorskip("safetensors.numpy")
 
-METADATA = {"format": "stereokit-refiner/1", "network": "cnn", "form": "residual", "ranges": "{}", "notes": "{}"}
+METADATA = {"format": "stereokit-refiner/2", "network": "cnn", "form": "residual", "ranges": "{}", "notes": "{}"}
 
 
 def raw(path, arrays=None, **metadata):
@@ -99,7 +100,7 @@ def test_loading_never_runs_code(tmp_path):
 @pytest.mark.parametrize(
     ("metadata", "parts"),
     [
-        ({"format": "stereokit-refiner/2"}, ["stereokit-refiner/1", "stereokit-refiner/2"]),
+        ({"format": "stereokit-refiner/3"}, ["stereokit-refiner/2", "stereokit-refiner/3"]),
         ({"format": ""}, ["format"]),
         ({"network": "resnet"}, ["no network named 'resnet'", "cnn, stereokit, stereovae"]),
         ({"network": ""}, ["no network named ''"]),
@@ -118,6 +119,18 @@ def test_wrong_metadata(tmp_path, metadata, parts):
     refused(raw(tmp_path / "w.safetensors", **metadata), *parts)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_of_format_1_are_refused(name, tmp_path):
+    """They fit by their shapes, but saw a mask where the network now sees the confidence."""
+    path = raw(tmp_path / "old.safetensors", random_arrays(name), network=name, format="stereokit-refiner/1")
+    with pytest.raises(FileError) as caught:
+        read(path)
+    expected = "weights must have the format 'stereokit-refiner/2', got 'stereokit-refiner/1'"
+    assert one_line(caught.value) == f"{expected} in {str(path)!r}"
+    with pytest.raises(FileError, match=expected):
+        stereokit.Matcher("S2", scale=0.5, refiner=str(path))
+
+
 @pytest.mark.parametrize("bounds", [[np.nan] * 32, [np.inf] * 32, [-1.0] * 32, [1.0] * 31, [], [1.0] * 33])
 def test_ranges_that_are_no_ranges(tmp_path, bounds):
     """Not a number, negative, or not one for each of the 32 channels."""
@@ -131,7 +144,7 @@ def test_ranges_of_no_activation(tmp_path):
 def test_a_file_without_metadata(tmp_path):
     path = tmp_path / "w.safetensors"
     path.write_bytes(safetensors_numpy.save(random_arrays("cnn")))
-    refused(path, "weights must have the format 'stereokit-refiner/1', got None")
+    refused(path, "weights must have the format 'stereokit-refiner/2', got None")
 
 
 def test_wrong_arrays(tmp_path):

@@ -281,6 +281,64 @@ def test_half_size_keeps_full_size_pixels(method):
     assert abs(np.median(disparity[:, 40:]) - 12) < 0.5
 
 
+class Keeping:
+    """A refiner that keeps what it was given, and gives back a map with a confidence of 0.25."""
+
+    def __call__(self, coarse, left, *, threads=1):
+        self.coarse = coarse
+        shape = left.shape
+        return Disparity(np.zeros(shape, np.float32), np.ones(shape, bool), np.full(shape, 0.25, np.float32))
+
+
+class Needing(Keeping):
+    needs_confidence = True
+
+
+class Declining(Keeping):
+    needs_confidence = False
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_refiner_that_needs_a_confidence_is_given_it(random_pair, method):
+    left, right = random_pair(30, 50, seed=15)
+    options = {"max_disparity": 16, "scale": 0.5}
+    kinds = [(kind(), asked) for kind in (Keeping, Declining, Needing) for asked in (False, True)]
+    for refiner, asked in kinds:
+        result = Matcher(method, refiner=refiner, confidence=asked, **options)(left, right)
+        assert (refiner.coarse.confidence is None) == (not asked and not isinstance(refiner, Needing))
+        if asked:
+            assert (result.confidence == 0.25).all()
+        else:
+            assert result.confidence is None  # whatever the refiner returns
+    given = [refiner.coarse for refiner, _ in kinds]
+    for coarse in given:
+        np.testing.assert_array_equal(coarse.disparity, given[0].disparity)
+        np.testing.assert_array_equal(coarse.valid, given[0].valid)
+        if coarse.confidence is not None:
+            assert coarse.confidence.shape == (15, 25) and coarse.confidence.dtype == np.float32
+            np.testing.assert_array_equal(coarse.confidence, given[-1].confidence)
+    assert (given[-1].confidence[~given[-1].valid] == 0).all()
+    assert 0 <= given[-1].confidence.min() < given[-1].confidence.max() <= 1
+
+
+def test_the_right_view_is_refined_with_its_own_confidence(random_pair):
+    left, right = random_pair(30, 50, seed=16)
+    seen = []
+
+    class All(Needing):
+        def __call__(self, coarse, left, *, threads=1):
+            seen.append(coarse)
+            return super().__call__(coarse, left)
+
+    result = Matcher("census+sgm", max_disparity=16, scale=0.5, refiner=All(), right=True)(left, right)
+    assert result.confidence is None and result.right is not None
+    flipped = Matcher("census+sgm", max_disparity=16, scale=0.5, refiner=All())
+    flipped(right[:, ::-1].copy(), left[:, ::-1].copy())
+    assert len(seen) == 3
+    np.testing.assert_array_equal(seen[1].confidence, seen[2].confidence)
+    assert (seen[0].confidence != seen[1].confidence).any()
+
+
 def test_a_matcher_says_what_it_does():
     text = repr(Matcher("S2", max_disparity=16, paths=4))
     assert "census+sgm" in text

@@ -1,0 +1,112 @@
+"""A stereo video as pairs: left and right side by side in one file, or one file for each camera; OpenCV decodes.
+
+Frames are named by their number. They come one at a time and in order; those that are not wanted are passed over
+without being turned into pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import FileError, InputError
+
+__all__ = ["FramePair", "Video"]
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class FramePair:
+    """One frame: its name and two images, (H, W, 3) uint8 RGB, or why there is none."""
+
+    name: str
+    left: Image | None
+    right: Image | None
+    reason: str = ""
+
+
+class Video:
+    """A stereo video.
+
+    Parameters
+    ----------
+    left : Path
+        The left camera's video, or both side by side.
+    right : Path or None
+        The right camera's video.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be opened.
+    InputError
+        If the two differ in size, or the one cannot be halved.
+    """
+
+    def __init__(self, left: Path, right: Path | None = None) -> None:
+        self.paths = [left] if right is None else [left, right]
+        captures = [_open(path) for path in self.paths]
+        try:
+            sizes = [tuple(int(c.get(p)) for p in (_WIDTH, _HEIGHT)) for c in captures]
+            counts = [int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) for capture in captures]
+        finally:
+            for capture in captures:
+                capture.release()
+        if len(set(sizes)) > 1:
+            texts = " and ".join(f"{width}x{height}" for width, height in sizes)
+            raise InputError(f"the two videos must have the same size, got {texts}")
+        if right is None and sizes[0][0] % 2:
+            raise InputError(f"a video with both views side by side must have an even width, got {sizes[0][0]}")
+        self.expected: int | None = min(counts) if min(counts) > 0 else None  # what the files say; it may be wrong
+
+    def frames(self, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[FramePair]:
+        """Yield the frames whose names are wanted; where one of two videos ends early, a last one says so."""
+        captures = [_open(path) for path in self.paths]
+        try:
+            number = 0
+            while True:
+                name = f"{number:06d}"
+                there = [capture.grab() for capture in captures]
+                if not all(there):
+                    if any(there):
+                        side = "left" if not there[0] else "right"
+                        yield FramePair(name, None, None, f"the {side} video ends before the other")
+                    return
+                if wanted(name):
+                    yield _frame(name, captures)
+                number += 1
+        finally:
+            for capture in captures:
+                capture.release()
+
+
+_WIDTH, _HEIGHT = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+
+
+def _open(path: Path) -> Any:
+    if not path.exists():
+        raise FileError(f"no such file: {str(path)!r}")
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise FileError(f"{str(path)!r} is neither a folder, a list (.csv, .tsv, .txt) nor a video that can be read")
+    return capture
+
+
+def _frame(name: str, captures: list[Any]) -> FramePair:
+    images = []
+    for capture in captures:
+        good, image = capture.retrieve()
+        if not good or image is None:
+            return FramePair(name, None, None, "the frame cannot be decoded")
+        images.append(np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image))
+    if len(images) == 1:
+        half = images[0].shape[1] // 2
+        images = [np.ascontiguousarray(images[0][:, :half]), np.ascontiguousarray(images[0][:, half:])]
+    return FramePair(name, images[0], images[1])

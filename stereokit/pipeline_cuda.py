@@ -176,7 +176,7 @@ class CudaPipeline:
                 none = np.zeros(shape, np.bool_)
                 masks = (none if mask is None else mask for mask in (pair.left_bad, pair.right_bad))
                 bad = queue.upload("bad", np.stack(list(masks)).view(np.uint8))
-            found, shape = self._match(queue, images, dtype, guide, bad, (height, width))
+            found, shape = self._match(queue, images, dtype, guide, bad, (height, width), pair.ranges)
             disparity, valid = queue.fetch(found.disparity), queue.fetch(found.valid).view(np.bool_)
             confidence = None if found.confidence is None else queue.fetch(found.confidence).reshape(shape)
         return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence)
@@ -239,8 +239,9 @@ class CudaPipeline:
             free.append(queue)
 
     def _match(
-        self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape
-    ) -> tuple[_Found, Shape]:
+        self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
+        ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
+    ) -> tuple[_Found, Shape]:  # fmt: skip
         """Run all stages on grey images; return the maps and their size."""
         settings = self._settings
         if settings.half:
@@ -254,7 +255,7 @@ class CudaPipeline:
         if settings.smooth > 0:
             images, dtype = smooth(queue, images, dtype, settings.smooth, shape), np.dtype(np.uint16)
         masks = queue.array("no.bad", 1, np.uint8) if bad is None else bad
-        scene = Scene(images, dtype, masks, bad is not None, height, width, settings.levels, settings.outside)
+        scene = Scene(images, dtype, masks, bad is not None, height, width, settings.levels, settings.outside, ranges)
         if pixels * scene.padded >= 2**34:
             raise DeviceError(
                 f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * scene.padded}"

@@ -47,6 +47,7 @@ class Scene:
     levels : Levels
         Disparities to try.
     outside : float or None
+    ranges : ((int, int), (int, int)) or None
         As of `stereokit.costs.rows.Pair`.
     """
 
@@ -58,6 +59,7 @@ class Scene:
     width: int
     levels: Levels
     outside: float | None
+    ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
     @property
     def padded(self) -> int:

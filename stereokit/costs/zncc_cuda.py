@@ -57,7 +57,8 @@ def centre_kernel(dtype: np.dtype[Any]) -> Kernel:
             middle = i32(i32(low + high) >> i32(1))
             span = i32(max(i32(high - low), i32(1)))
             factor = min(f32(1), f32(f32(range_max) / f32(span)))
-            value = f32(f32(i32(i32(images[u32(y * u32(width) + u32(x))]) - middle)) * factor)
+            pixel = min(max(i32(images[u32(y * u32(width) + u32(x))]), low), high)  # of a window it may leave the range
+            value = f32(f32(i32(pixel - middle)) * factor)
             out[at] = i16(cuda.libdevice.float2int_rn(value))
 
     made: Kernel = zncc_centre
@@ -224,7 +225,10 @@ def volume(queue: Queue, cost: Zncc, scene: Scene) -> Any:
     """
     check_window(cost)
     height, width = scene.height, scene.width
-    extremes = ranges(queue, scene.images, scene.dtype, height * width)
+    if scene.ranges is None:
+        extremes = ranges(queue, scene.images, scene.dtype, height * width)
+    else:
+        extremes = queue.upload("zncc.ranges", np.array(scene.ranges, np.int32))
     first = -scene.levels.minimum - (scene.padded - 1)
     left = statistics(queue, cost, scene, extremes, 0, 0, width, cost.steps)
     right = statistics(queue, cost, scene, extremes, 1, first, scene.reach, 1)

@@ -14,7 +14,7 @@ from stereokit.kernels.workspace import Workspace
 
 def check_volume(
     queue: Any, cost: Any, shape: tuple[int, int], levels: Levels, outside: float | None = 0.5, masked: bool = False,
-    dtype: type = np.uint8,
+    dtype: type = np.uint8, ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
 ) -> None:  # fmt: skip
     """Compare all cells of a random pair with a flat patch in it, and the levels that pad."""
     rng = np.random.default_rng(0)
@@ -22,11 +22,11 @@ def check_volume(
     left[1:5, 2 : shape[1] // 2] = 77
     bad = rng.random((2, *shape)) < 0.1
     masks = tuple(bad) if masked else (None, None)
-    rows = cost.prepare(Pair(left, right, *masks, levels, outside), Workspace(), 1)
+    rows = cost.prepare(Pair(left, right, *masks, levels, outside, 1, ranges), Workspace(), 1)
     want = produce_volume(rows, shape, levels, 1)
     images = queue.upload("images", np.stack([left, right]))
     known = queue.upload("bad", bad.view(np.uint8)) if masked else queue.array("bad", 1, np.uint8)
-    scene = Scene(images, np.dtype(dtype), known, masked, *shape, levels, outside)
+    scene = Scene(images, np.dtype(dtype), known, masked, *shape, levels, outside, ranges)
     module = census_cuda if isinstance(cost, Census) else zncc_cuda
     found = queue.fetch(queue.view(module.volume(queue, cost, scene), np.uint8)).reshape(*shape, scene.padded)
     np.testing.assert_array_equal(found[:, :, : levels.count], want)

@@ -41,6 +41,11 @@ def test_sizes_and_levels(shape, levels, outside):
     bodies.check_volume(EmulatedQueue(), Zncc(5), shape, levels, outside)
 
 
+def test_windows_of_larger_images_take_the_range_of_the_whole():
+    ranges = ((5, 240), (20, 300))
+    bodies.check_volume(EmulatedQueue(), Zncc(5), (5, 23), Levels(0, 8), ranges=ranges)
+
+
 def test_a_window_that_no_register_holds_is_refused():
     with pytest.raises(DeviceError, match="window of zncc must be at most 11 on device 'cuda', got 13"):
         check_window(Zncc(13))

@@ -61,6 +61,12 @@ class EmulatedQueue:
         report = run(what, blocks, *arguments, seed=self.seed)
         self.launches.append((what.name, blocks, report))
 
+    def copy(self, held: Buffer) -> Buffer:
+        """Return a new array with the same content."""
+        made = Buffer(held.size, held.dtype)
+        made.values[:], made.known[:] = held.values, held.known
+        return made
+
     def fetch(self, held: Buffer) -> np.ndarray:
         """Return a copy of an array."""
         return held.values.copy()

@@ -36,11 +36,33 @@ class Buffer:
         self.values = np.random.default_rng(bytes_).integers(0, 256, bytes_, np.uint8).view(dtype)
         self.known = np.zeros(bytes_, np.uint8)
 
+    @classmethod
+    def _of(cls, values: np.ndarray, known: np.ndarray) -> Buffer:
+        made = cls.__new__(cls)
+        made.values, made.known = values, known
+        return made
+
     def view(self, dtype: Any) -> Buffer:
         """Return the same memory as another type."""
-        other = Buffer.__new__(Buffer)
-        other.values, other.known = self.values.view(dtype), self.known
-        return other
+        return self._of(self.values.view(dtype), self.known)
+
+    def __getitem__(self, part: slice) -> Buffer:
+        """Return a run of the elements, the same memory."""
+        first, last, step = part.indices(self.values.size)
+        if step != 1:
+            raise ValueError(f"want a slice without step, got {part}")
+        width = self.values.itemsize
+        return self._of(self.values[first:last], self.known[first * width : last * width])
+
+    @property
+    def size(self) -> int:
+        """Elements."""
+        return self.values.size
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the elements."""
+        return self.values.dtype
 
 
 @dataclass(frozen=True)
@@ -96,35 +118,64 @@ def run(
     """
     made = translation_of(kernel)
     plain = isinstance(kernel, str)
+    _check(kernel, arguments)
+    regions, places = _regions(arguments)
     parameters: list[Any] = []
-    regions: list[Region] = []
-    places: dict[int, int] = {}
-    order: list[Region] = []
     for number, argument in enumerate(arguments):
-        if not isinstance(argument, np.ndarray | Buffer):
+        if number not in places:
             parameters.append(argument)
             continue
         values = argument.values if isinstance(argument, Buffer) else argument
-        if values.ndim != 1 or not values.flags.c_contiguous:
-            raise ValueError(f"argument {number} must be a flat array, got shape {values.shape}")
-        start = values.__array_interface__["data"][0]
-        if start not in places:
-            places[start] = len(regions)
-            known = argument.known if isinstance(argument, Buffer) else None
-            regions.append(Region(f"argument {number}", values.view(np.uint8), known))
-        at = places[start]
-        if regions[at].values.size != values.nbytes:
-            raise ValueError(f"argument {number} overlaps an earlier one of another size")
-        order.append(regions[at])
-        address = Machine.address(at)
+        at, offset = places[number]
+        address = Machine.address(at) + offset
         if plain:
             parameters.append(address)
         else:
             parameters += [0, 0, values.size, values.itemsize, address, values.size, values.itemsize]
-    _check(kernel, arguments)
     machine = Machine(made, blocks, block or kernel.block, parameters, regions, seed, max_runs)
     machine.run()
+    order = [regions[places[number][0]] for number in sorted(places)]
     return Report(machine.instructions, tuple(r.read for r in order), tuple(r.written for r in order))
+
+
+def _root(values: np.ndarray) -> np.ndarray:
+    while isinstance(values.base, np.ndarray):
+        values = values.base
+    return values
+
+
+def _regions(arguments: tuple[Any, ...]) -> tuple[list[Region], dict[int, tuple[int, int]]]:
+    """Return the memory of all array arguments, and for each of these its region and its first byte in there.
+
+    An array is a region of its own, so that no access may leave it, unless another argument overlaps it.
+    """
+    spans: dict[int, list[tuple[int, int, int]]] = {}
+    roots: dict[int, tuple[np.ndarray, Any]] = {}
+    for number, argument in enumerate(arguments):
+        if not isinstance(argument, np.ndarray | Buffer):
+            continue
+        values = argument.values if isinstance(argument, Buffer) else argument
+        if values.ndim != 1 or not values.flags.c_contiguous:
+            raise ValueError(f"argument {number} must be a flat array, got shape {values.shape}")
+        root = _root(values)
+        start = values.__array_interface__["data"][0] - root.__array_interface__["data"][0]
+        spans.setdefault(id(root), []).append((start, start + values.nbytes, number))
+        known = argument.known if isinstance(argument, Buffer) else None
+        roots[id(root)] = root, None if known is None else _root(known)
+    regions: list[Region] = []
+    places: dict[int, tuple[int, int]] = {}
+    for key, members in spans.items():
+        root, known = roots[key]
+        root = root.reshape(-1).view(np.uint8)
+        distinct = sorted({(first, last) for first, last, _ in members})
+        overlap = any(b[0] < a[1] for a, b in zip(distinct, distinct[1:], strict=False))
+        for first, last in [(0, root.size)] if overlap else distinct:
+            inside = [member for member in members if first <= member[0] < max(last, first + 1) and member[1] <= last]
+            name = " and ".join(f"argument {number}" for _, _, number in inside)
+            for start, _, number in inside:
+                places[number] = len(regions), start - first
+            regions.append(Region(name, root[first:last], None if known is None else known[first:last]))
+    return regions, places
 
 
 def _check(kernel: Any, arguments: tuple[Any, ...]) -> None:

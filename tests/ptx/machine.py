@@ -246,10 +246,10 @@ class Machine:
         lane = self.threads.lane_of[warp]
         for mask in np.unique(masks):
             group = here[masks == mask]
-            bits = (int(mask) >> self.threads.lane_of[group]) & 1
+            bits = (int(mask) >> self.threads.lane_of[group].astype(np.int64)) & 1
             if not bits.all():
                 raise BadShuffle(f"{self.threads.name(int(group[0]))} is not in its own mask {mask:#010x}: {one.text}")
-            named = warp[(int(mask) >> lane) & 1 == 1]
+            named = warp[(int(mask) >> lane.astype(np.int64)) & 1 == 1]
             gone = named[self.state[named] == _DONE]
             if gone.size or (self.block % 32 and int(mask) >> (int(lane.max()) + 1)):
                 who = self.threads.name(int(gone[0])) if gone.size else "a lane past the block's end"

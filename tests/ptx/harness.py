@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -168,7 +169,7 @@ def _regions(arguments: tuple[Any, ...]) -> tuple[list[Region], dict[int, tuple[
         root, known = roots[key]
         root = root.reshape(-1).view(np.uint8)
         distinct = sorted({(first, last) for first, last, _ in members})
-        overlap = any(b[0] < a[1] for a, b in zip(distinct, distinct[1:], strict=False))
+        overlap = any(b[0] < a[1] for a, b in itertools.pairwise(distinct))
         for first, last in [(0, root.size)] if overlap else distinct:
             inside = [member for member in members if first <= member[0] < max(last, first + 1) and member[1] <= last]
             name = " and ".join(f"argument {number}" for _, _, number in inside)

@@ -162,6 +162,9 @@ class Machine:
         waiting = np.flatnonzero(self.state == _IN_WARP)
         if waiting.size:
             first = int(waiting[0])
+            same_warp = self.threads.warp_of == self.threads.warp_of[first]
+            if (self.state[same_warp] == _DONE).any():
+                raise BadShuffle(f"{self._text(first)} names lanes that have returned: {self.threads.name(first)}")
             raise Deadlock(f"lanes of its warp never come to {self._text(first)}: {self.threads.name(first)}")
         first = int(np.flatnonzero(self.state == _AT_BARRIER)[0])
         same = self.threads.block_of == self.threads.block_of[first]

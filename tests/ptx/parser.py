@@ -96,7 +96,7 @@ def parse(text: str) -> Program:
     for kind, names in re.findall(r"\.reg\s+\.(\w+)\s+((?:%?\w+\s*,?\s*)+);", body):
         for name in re.findall(r"%?(\w+)", names):
             program.registers[name] = KINDS[kind].replace("i", "u")
-    body = re.sub(r"^\s*\.(reg|local|shared|pragma|param)\b[^;]*;", "", body, flags=re.M)
+    body = re.sub(r"(?:^|(?<=[;{}\n]))\s*\.(reg|local|shared|pragma|param)\b[^;]*;", "", body)
     body = re.sub(r"^\s*\.(loc|file|section)\b[^\n]*$", "", body, flags=re.M)
     body = re.sub(r"^\s*[{}]\s*$", "", body, flags=re.M)
     for statement in body.split(";"):

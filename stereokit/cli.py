@@ -275,7 +275,7 @@ def info(json_file: JsonOption = None) -> None:
     import llvmlite.binding
     import numba
 
-    from stereokit.kernels import pool, simd
+    from stereokit.kernels import device, pool, simd
 
     vector_bits = getattr(simd, "vector_bits", None)
     content: dict[str, Any] = {
@@ -291,7 +291,9 @@ def info(json_file: JsonOption = None) -> None:
         "vector_bits": None if vector_bits is None else vector_bits(),
         "threads": pool.available_threads(),
         "numba_cache": numba.config.CACHE_DIR or "beside the modules, in __pycache__",
-        "cuda": _has_cuda_driver(),
+        "cuda": device.has_device(),
+        "gpu": device.describe(),
+        "numba_cuda": _version("numba-cuda"),
     }
     table = Table("What", "Value")
     for name, value in content.items():
@@ -409,12 +411,6 @@ def _waiting(text: str) -> Iterator[None]:
         timer.cancel()
         timer.join()
         status.stop()
-
-
-def _has_cuda_driver() -> bool:
-    from ctypes.util import find_library
-
-    return Path("/proc/driver/nvidia").exists() or bool(find_library("cuda") or find_library("nvcuda"))
 
 
 if __name__ == "__main__":

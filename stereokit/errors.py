@@ -9,7 +9,15 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["FileError", "InputError", "OptionError", "StereokitError", "UnknownNameError", "did_you_mean"]
+__all__ = [
+    "DeviceError",
+    "FileError",
+    "InputError",
+    "OptionError",
+    "StereokitError",
+    "UnknownNameError",
+    "did_you_mean",
+]
 
 
 class StereokitError(ValueError):
@@ -22,6 +30,10 @@ class InputError(StereokitError):
 
 class OptionError(StereokitError):
     """An option has a value outside its rule, or does not exist."""
+
+
+class DeviceError(OptionError):
+    """The device that was asked for is not there, or cannot do what was asked."""
 
 
 class UnknownNameError(OptionError):

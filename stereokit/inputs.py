@@ -110,6 +110,8 @@ def checked_image(name: str, image: Any) -> NDArray[Any]:
     """Return an image of an accepted type and shape, (H, W) or (H, W, 3)."""
     if isinstance(image, np.ma.MaskedArray):
         raise InputError(f"{name} must be a plain array, got a masked one; put NaN where there is no evidence")
+    if hasattr(image, "__cuda_array_interface__"):
+        raise InputError(f"{name} must lie in host memory here, got an array on a GPU; see Matcher.on_device")
     try:
         array = np.asarray(image)
     except ValueError as error:

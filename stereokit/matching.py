@@ -12,14 +12,14 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Levels, Pair
 from stereokit.defaults import METHODS, defaults_of
-from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
+from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.inputs import (
     GrayPair,
     check_flag,
@@ -31,6 +31,7 @@ from stereokit.inputs import (
     half_size,
     smooth,
 )
+from stereokit.kernels.device import has_device, require_device
 from stereokit.kernels.pool import available_threads, crew
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.methods import check_levels, find_refiner, option_names, parse_method
@@ -39,6 +40,9 @@ from stereokit.postprocess.fill import FILLS
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
 from stereokit.selection.wta import winners_like
+
+if TYPE_CHECKING:
+    from stereokit.pipeline_cuda import CudaPipeline, DeviceDisparity
 
 __all__ = ["METHODS", "Matcher", "match", "warmup"]
 
@@ -72,7 +76,8 @@ class Matcher:
         For ``scale=0.5``: the name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
         `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
     device : {"auto", "cpu", "cuda"}
-        Where to compute. There are no CUDA kernels yet: "auto" is the CPU and "cuda" is refused.
+        Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``; "auto" takes it
+        where it can be used, else the CPU. Refiners run on the CPU.
     threads : int or None
         Threads of one call; None uses the processors at hand. The result does not depend on it.
     fill : {"background", "nearest"} or None
@@ -91,6 +96,8 @@ class Matcher:
     ------
     OptionError
         If an option does not exist or breaks its rule.
+    DeviceError
+        If `device` is "cuda" and there is no GPU, or a stage has no CUDA kernels.
 
     Examples
     --------
@@ -117,8 +124,7 @@ class Matcher:
         if not isinstance(device, str) or device not in ("auto", "cpu", "cuda"):
             raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {device!r}")
         if device == "cuda":
-            raise OptionError("device 'cuda' is not available in this version; use 'cpu' or 'auto'")
-        self.device = "cpu"
+            require_device()
         self.threads = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
         if refiner is not None and self.scale == 1:
             raise OptionError(f"refiner needs scale=0.5, got refiner={refiner!r} with scale=1")
@@ -131,6 +137,32 @@ class Matcher:
         self._needs_confidence = bool(getattr(self._refine, "needs_confidence", False))
         self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
         self._pool = Pool()
+        self.device = "cpu"
+        self._cuda: CudaPipeline | None = None
+        if device == "cuda" or (device == "auto" and has_device()):
+            self._set_device(fall_back=device == "auto")
+
+    def _set_device(self, fall_back: bool) -> None:
+        from stereokit.pipeline_cuda import CudaPipeline, Settings  # numba.cuda is imported late
+
+        settings = Settings(
+            self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
+            self.uniqueness, self.confidence or self._needs_confidence, self.right, self.smp, self.speckle, self.fill,
+            self.median,
+        )  # fmt: skip
+        try:
+            self._cuda = CudaPipeline(settings)
+            self.device = "cuda"
+        except DeviceError:
+            if not fall_back:
+                raise
+
+    def _levels(self) -> Levels:
+        """Return the levels of the size at which is matched."""
+        low, high = self.min_disparity, self.max_disparity
+        if self.scale == 0.5:
+            low, high = low // 2, max(-(-high // 2), low // 2 + 1)
+        return Levels(low, high - low)
 
     def _set_stages(self, options: dict[str, Any], elsewhere: list[str]) -> None:
         cost_name, aggregation_name = self.method.split("+")
@@ -161,15 +193,45 @@ class Matcher:
         self.right = check_flag("right", merged["right"])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_pool"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_pool", "_cuda")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._pool = Pool()
+        self._cuda = None
+        if self.device == "cuda":
+            require_device()
+            self._set_device(fall_back=False)
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
         return f"Matcher({self.method!r}, {levels}, scale={self.scale:g}, {self.cost}, {self.aggregation})"
+
+    def on_device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
+        """Match a rectified pair that lies on the GPU, such as PyTorch's CUDA tensors; the map stays there.
+
+        Parameters
+        ----------
+        left, right : (H, W) or (H, W, 3) uint8, C-contiguous, with ``__cuda_array_interface__``
+            Grey or RGB; taken without a copy and never modified.
+        stream : stream of PyTorch, CuPy or numba, int, or None
+            The CUDA stream to run on; None is the default stream. Nothing waits for it.
+
+        Returns
+        -------
+        stereokit.pipeline_cuda.DeviceDisparity
+            Arrays with ``__cuda_array_interface__``: ``torch.as_tensor(result.disparity)`` takes one without a copy.
+
+        Raises
+        ------
+        InputError
+            If the images cannot be used.
+        DeviceError
+            If the matcher's device is not "cuda", `scale` is not 1, or the device is short of memory.
+        """
+        if self._cuda is None:
+            raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
+        return self._cuda.device(left, right, stream)
 
     def __call__(self, left: Any, right: Any) -> Disparity:
         """Match a rectified pair.
@@ -220,7 +282,8 @@ class Matcher:
         """
         ahead: deque[Future[Disparity]] = deque()
         source = iter(pairs)
-        with ThreadPoolExecutor(self.threads, thread_name_prefix="stereokit-map") as executor:
+        workers = self.threads if self._cuda is None else min(2, self.threads)  # each has buffers on the device
+        with ThreadPoolExecutor(workers, thread_name_prefix="stereokit-map") as executor:
             try:
                 failure: BaseException | None = None  # of the source: what it gave before is still matched
                 for done in itertools.count(1):
@@ -258,16 +321,16 @@ class Matcher:
 
     def match_gray(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
         """Match a pair that was checked and is grey, with buffers of the caller; no right view's map."""
+        if self._cuda is not None:
+            found = self._cuda.host(pair)
+        else:
+            with crew(threads):
+                same = self._refine is None
+                found = self._match_with_crew(pair if same else half_size(pair), self._levels(), workspace, threads)
         if self._refine is None:
-            return self._match_levels(pair, self.min_disparity, self.max_disparity, workspace, threads)
-        low, high = self.min_disparity // 2, -(-self.max_disparity // 2)
-        coarse = self._match_levels(half_size(pair), low, max(high, low + 1), workspace, threads)
-        refined = self._refine(coarse, pair.guide, threads=threads)
+            return found
+        refined = self._refine(found, pair.guide, threads=threads)
         return refined if self.confidence else Disparity(refined.disparity, refined.valid)
-
-    def _match_levels(self, pair: GrayPair, low: int, high: int, workspace: Workspace, threads: int) -> Disparity:
-        with crew(threads):
-            return self._match_with_crew(pair, Levels(low, high - low), workspace, threads)
 
     def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
         low = levels.minimum

@@ -30,7 +30,7 @@ from stereokit.registry import COSTS
 
 __all__ = ["Census"]
 
-_WINDOWS = {"5x5": (5, 5), "7x7": (7, 7), "9x7": (9, 7)}
+WINDOWS = {"5x5": (5, 5), "7x7": (7, 7), "9x7": (9, 7)}
 
 
 class CensusRows(NamedTuple):
@@ -59,13 +59,13 @@ class Census:
     name: ClassVar[str] = "census"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.window, str) or self.window not in _WINDOWS:
-            raise OptionError(f"window of census must be one of {', '.join(_WINDOWS)}, got {self.window!r}")
+        if not isinstance(self.window, str) or self.window not in WINDOWS:
+            raise OptionError(f"window of census must be one of {', '.join(WINDOWS)}, got {self.window!r}")
 
     @property
     def cost_max(self) -> int:
         """Largest cost."""
-        width, height = _WINDOWS[self.window]
+        width, height = WINDOWS[self.window]
         return width * height - 1
 
     @property
@@ -81,7 +81,7 @@ class Census:
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[CensusRows]:
         """Transform both images; return the row producers of `workers` sweeps."""
         height, width = pair.left.shape
-        across, down = (size // 2 for size in _WINDOWS[self.window])
+        across, down = (size // 2 for size in WINDOWS[self.window])
         margin = max(across, down)
         offsets = [(dy, dx) for dy in range(-down, down + 1) for dx in range(-across, across + 1) if (dy, dx) != (0, 0)]
         dy, dx = (np.array(part, np.int64) for part in zip(*offsets, strict=True))

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError, UnknownNameError, did_you_mean
-from stereokit.kernels.jit import kernel
+from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
 
-__all__ = ["FILLS", "fill", "fill_empty_rows", "fill_rows"]
+__all__ = ["FILLS", "fill", "fill_empty_rows", "fill_rows", "gap_value"]
 
 FILLS = ("background", "nearest")
 
@@ -57,6 +57,14 @@ def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: i
     return out
 
 
+@inline
+def gap_value(left: np.float32, right: np.float32, to_left: int, to_right: int, nearest: bool) -> np.float32:
+    """Return what a gap's pixel takes from its valid ends, which are so many pixels away."""
+    if nearest and to_left != to_right:
+        return left if to_left < to_right else right
+    return min(left, right)
+
+
 @kernel
 def fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -> int:
     """Fill the gaps of rows y0..y1 that have a valid pixel, in place; return how many rows have none."""
@@ -71,12 +79,9 @@ def fill_rows(disparity: NDArray[np.float32], y0: int, y1: int, nearest: bool) -
             if last < 0:
                 row[:x] = row[x]
             elif x - last > 1:
-                low = min(row[last], row[x])
+                left, right = row[last], row[x]
                 for gap in range(last + 1, x):
-                    value = low
-                    if nearest and gap - last != x - gap:
-                        value = row[last] if gap - last < x - gap else row[x]
-                    row[gap] = value
+                    row[gap] = gap_value(left, right, gap - last, x - gap, nearest)
             last = x
         if last >= 0:
             row[last + 1 :] = row[last]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.kernels.jit import kernel
+from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
 
-__all__ = ["resolve_rows", "single_matching_phase"]
+__all__ = ["resolve_rows", "right_column", "single_matching_phase"]
 
 
 def single_matching_phase(
@@ -53,6 +53,16 @@ def single_matching_phase(
     return out
 
 
+@inline
+def right_column(x: int, d: np.float32, width: int) -> int:
+    """Return the right column that left column `x` matches, or -1 if none: outside the image, or `d` is NaN."""
+    at = np.float32(x) - d + np.float32(0.5)
+    column: int = np.int64(-1)
+    if at >= np.float32(0) and at < np.float32(width):  # NaN is neither
+        column = np.int64(np.int32(at))
+    return column
+
+
 @kernel
 def resolve_rows(
     disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int, owner: NDArray[np.int32]
@@ -64,11 +74,10 @@ def resolve_rows(
         owner[:] = -1
         for x in range(width):
             d = row[x]
-            at = np.float32(x) - d + np.float32(0.5)
-            if not (at >= np.float32(0) and at < np.float32(width)):  # NaN is neither
+            xr = right_column(x, d, width)
+            if xr < 0:
                 row[x] = np.nan
                 continue
-            xr = np.int64(np.int32(at))
             held = owner[xr]
             if held < 0:
                 owner[xr] = np.int32(x)

@@ -19,7 +19,7 @@ from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["erase", "find_regions", "join_rows", "remove_speckles"]
+__all__ = ["alike", "erase", "find_regions", "join_rows", "remove_speckles"]
 
 
 def remove_speckles(
@@ -70,6 +70,13 @@ def remove_speckles(
 
 
 @inline
+def alike(a: np.float32, b: np.float32, limit: np.float32) -> bool:
+    """Whether neighbours with these disparities belong to one region; a NaN belongs to none."""
+    near: bool = abs(a - b) <= limit
+    return near
+
+
+@inline
 def _unite(parent: NDArray[np.int32], count: NDArray[np.int32], a: int, b: int) -> None:
     """Join two regions under the older one, which then holds the pixels of both."""
     while parent[a] != a:
@@ -110,7 +117,7 @@ def find_regions(
             joined = np.int32(-1)  # the label above that this run was last joined to
             while True:
                 label[at] = np.int32(mine)
-                if above and abs(d - disparity[at - width]) <= limit and label[at - width] != joined:
+                if above and alike(d, disparity[at - width], limit) and label[at - width] != joined:
                     joined = label[at - width]
                     _unite(parent, count, mine, np.int64(joined))
                 at += 1
@@ -118,7 +125,7 @@ def find_regions(
                     break
                 before = d
                 d = disparity[at]
-                if not abs(d - before) <= limit:
+                if not alike(d, before, limit):
                     break
             root = mine
             while parent[root] != root:
@@ -133,7 +140,7 @@ def join_rows(
 ) -> None:  # fmt: skip
     """Join the regions of row `y` of the flat map with those of the row above."""
     for at in range(y * width, (y + 1) * width):
-        if abs(disparity[at] - disparity[at - width]) <= limit:
+        if alike(disparity[at], disparity[at - width], limit):
             _unite(parent, count, np.int64(label[at]), np.int64(label[at - width]))
 
 

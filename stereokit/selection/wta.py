@@ -17,7 +17,7 @@ from stereokit.inputs import MAX_DISPARITY, check_flag, check_integer
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.simd import LANES, choose, first_bit, load, lowest, mask_equal, minimum, splat
 
-__all__ = ["Winners", "select", "select_row", "winners_like"]
+__all__ = ["Winners", "margin_of", "parabola", "select", "select_row", "winners_like"]
 
 
 class Winners(NamedTuple):
@@ -49,6 +49,21 @@ def _best_level(keys: NDArray[Any], at: int, blocks: tuple[int, ...]) -> tuple[A
 
 
 @inline
+def parabola(before: np.float32, best: np.float32, behind: np.float32) -> np.float32:
+    """Return where between its neighbours the lowest point of three costs lies, as an offset in levels."""
+    bend = before + behind - np.float32(2) * best
+    offset: np.float32 = (before - behind) / (np.float32(2) * bend) if bend > np.float32(0) else np.float32(0)
+    return offset
+
+
+@inline
+def margin_of(best: np.float32, rival: np.float32) -> np.float32:
+    """Return by which share of the rival's cost the best one is lower."""
+    share: np.float32 = (rival - best) / rival if rival > np.float32(0) else np.float32(0)
+    return share
+
+
+@inline
 def select_pixel(
     keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], to: int, out: Winners
 ) -> None:
@@ -62,9 +77,7 @@ def select_pixel(
     if out.subpixel and level > 0 and level < out.levels - 1:
         before = np.float32(values[at + level - 1])
         behind = np.float32(values[at + level + 1])
-        bend = before + behind - np.float32(2) * best
-        if bend > np.float32(0):
-            disparity += (before - behind) / (np.float32(2) * bend)
+        disparity += parabola(before, best, behind)
     out.disparity[to] = disparity
     out.cost[to] = values[at + level]
     if out.confidence.size > 0 or out.uniqueness > np.float32(0):
@@ -95,7 +108,7 @@ def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int
     keys[at + behind_last - 1] = held_2
     if other >= levels or (other >= first and other < behind_last):
         return np.float32(1)
-    return (rival - best) / rival if rival > np.float32(0) else np.float32(0)
+    return margin_of(best, rival)
 
 
 @kernel

@@ -1,0 +1,112 @@
+"""On a real GPU: what the interpreter runs on small images, full images, streams, tensors and memory."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from stereokit import Matcher
+from stereokit.aggregation.sgm import Sgm
+from stereokit.costs import Census, Zncc
+from stereokit.costs.rows import Levels
+from stereokit.errors import DeviceError
+from stereokit.kernels.device import describe, has_device
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not has_device(), reason=f"no GPU to run on: {describe()}"),
+]
+
+SHAPE = (375, 1242)
+
+
+@pytest.fixture
+def queue():
+    from stereokit.kernels.queue_cuda import DeviceQueue
+
+    return DeviceQueue()
+
+
+def _pair(shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, np.ndarray]:
+    """Return a textured pair in which disparity grows from the left to the right."""
+    rng = np.random.default_rng(0)
+    height, width = shape
+    wide = rng.integers(0, 256, (height, width + 64), dtype=np.uint8)
+    columns = np.arange(width)
+    return wide[:, columns], wide[:, columns + 64 * columns // width]
+
+
+def test_bodies(queue):
+    """Run each check of the interpreter's that needs nothing but a queue."""
+    import ptx
+
+    ran = 0
+    for module in pkgutil.iter_modules(ptx.__path__):
+        held = importlib.import_module(f"ptx.{module.name}") if module.name.startswith("bodies_") else None
+        for name, check in vars(held).items() if held else ():
+            if name.startswith("check_"):
+                parameters = inspect.signature(check).parameters.values()
+                if sum(parameter.default is parameter.empty for parameter in parameters) == 1:
+                    check(queue)
+                    ran += 1
+    assert ran > 10
+
+
+@pytest.mark.parametrize("cost", [Census("5x5"), Census("9x7"), Zncc(3), Zncc(5), Zncc(11)], ids=str)
+def test_costs_of_a_full_image(queue, cost):
+    from ptx.bodies_costs import check_volume
+
+    check_volume(queue, cost, SHAPE, Levels(0, 128))
+
+
+@pytest.mark.parametrize(("paths", "count"), [(4, 128), (5, 64), (8, 128), (4, 300)])
+def test_paths_of_a_full_image(queue, paths, count):
+    from ptx.bodies_sgm import check_paths
+
+    check_paths(queue, Sgm(15, 85, paths=paths), SHAPE, count, uniqueness=2.0)
+
+
+@pytest.mark.parametrize("method", ["S1", "S2", "S3", "S4"])
+def test_matchers_on_full_images(method):
+    pair = _pair()
+    options = {"max_disparity": 128, "confidence": True, "right": True}
+    found, want = (Matcher(method, device=device, **options)(*pair) for device in ("cuda", "cpu"))
+    for name in ("disparity", "valid", "confidence", "right"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(want, name), name)
+
+
+def test_calls_from_many_threads():
+    matcher = Matcher("S2", device="cuda", max_disparity=64)
+    pair = _pair((120, 300))
+    want = matcher(*pair).disparity
+    with ThreadPoolExecutor(4) as executor:
+        for found in executor.map(lambda _: matcher(*pair).disparity, range(16)):
+            np.testing.assert_array_equal(found, want)
+
+
+def test_tensors_go_in_and_out_without_a_copy():
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("PyTorch was built without CUDA")
+    left, right = _pair((120, 300))
+    matcher = Matcher("S4", device="cuda", max_disparity=64)
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        tensors = torch.as_tensor(left, device="cuda"), torch.as_tensor(right, device="cuda")
+        found = matcher.on_device(*tensors, stream=stream)
+        disparity = torch.as_tensor(found.disparity, device="cuda")
+    stream.synchronize()
+    assert disparity.data_ptr() == found.disparity.__cuda_array_interface__["data"][0]
+    np.testing.assert_array_equal(disparity.cpu().numpy(), matcher(left, right).disparity)
+
+
+def test_too_large_a_volume_names_what_is_needed_and_free():
+    matcher = Matcher("S2", device="cuda", max_disparity=2048, paths=8)
+    image = np.zeros((2800, 2900), np.uint8)  # seven volumes of 16.6 GB
+    with pytest.raises(DeviceError, match=r"out of device memory: '[\w.]+' needs \d+ bytes, \d+ of \d+ are free"):
+        matcher(image, image)

@@ -1,0 +1,49 @@
+"""Cost volumes on a queue, against the CPU's cost rows: equal in every cell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stereokit.costs import Census, Zncc, census_cuda, zncc_cuda
+from stereokit.costs.rows import Levels, Pair, produce_volume
+from stereokit.costs.rows_cuda import Scene
+from stereokit.kernels.workspace import Workspace
+
+
+def check_volume(
+    queue: Any, cost: Any, shape: tuple[int, int], levels: Levels, outside: float | None = 0.5, masked: bool = False,
+    dtype: type = np.uint8, ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
+) -> None:  # fmt: skip
+    """Compare all cells of a random pair with a flat patch in it, and the levels that pad."""
+    rng = np.random.default_rng(0)
+    left, right = rng.integers(0, np.iinfo(dtype).max, (2, *shape), dtype, endpoint=True)
+    left[1:5, 2 : shape[1] // 2] = 77
+    bad = rng.random((2, *shape)) < 0.1
+    masks = tuple(bad) if masked else (None, None)
+    rows = cost.prepare(Pair(left, right, *masks, levels, outside, 1, ranges), Workspace(), 1)
+    want = produce_volume(rows, shape, levels, 1)
+    images = queue.upload("images", np.stack([left, right]))
+    known = queue.upload("bad", bad.view(np.uint8)) if masked else queue.array("bad", 1, np.uint8)
+    scene = Scene(images, np.dtype(dtype), known, masked, *shape, levels, outside, ranges)
+    module = census_cuda if isinstance(cost, Census) else zncc_cuda
+    found = queue.fetch(queue.view(module.volume(queue, cost, scene), np.uint8)).reshape(*shape, scene.padded)
+    np.testing.assert_array_equal(found[:, :, : levels.count], want)
+    assert (found[:, :, levels.count :] == 255).all()
+
+
+def check_census(queue):
+    check_volume(queue, Census("5x5"), (6, 35), Levels(0, 10))
+
+
+def check_census_of_two_words(queue):
+    check_volume(queue, Census("9x7"), (5, 19), Levels(-4, 12), outside=None, masked=True)
+
+
+def check_zncc(queue):
+    check_volume(queue, Zncc(5), (4, 70), Levels(0, 9))
+
+
+def check_zncc_with_masks(queue):
+    check_volume(queue, Zncc(3, 200), (5, 23), Levels(-4, 9), outside=None, masked=True)

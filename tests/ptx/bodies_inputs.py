@@ -1,0 +1,75 @@
+"""Grey, half size, Gaussian and ranges on a queue, against OpenCV and NumPy: equal to the last bit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereokit import inputs, inputs_cuda
+
+SHAPES = [(1, 1), (5, 33), (8, 7)]
+
+
+def _pair(shape: tuple[int, ...], dtype: type, seed: int = 0) -> np.ndarray:
+    low, high = (3, 250) if dtype is np.uint8 else (900, 65535)
+    return np.random.default_rng(seed).integers(low, high, (2, *shape), dtype, endpoint=True)
+
+
+def check_grey(queue, dtype=np.uint8):
+    for shape in SHAPES:
+        height, width = shape
+        colour = _pair((*shape, 3), dtype)
+        want = inputs.gray_pair(*colour)
+        out = queue.array("pair", 2 * height * width, dtype)
+        for place, image in enumerate(colour):
+            flat = queue.upload(f"in{place}", image)
+            inputs_cuda.take(queue, flat, np.dtype(dtype), out, place, 3, False, shape)
+        np.testing.assert_array_equal(queue.fetch(out).reshape(2, *shape), [want.left, want.right])
+
+
+def check_mirrored(queue, dtype=np.uint8):
+    for shape in SHAPES:
+        image = _pair(shape, dtype)[0]
+        out = queue.array("pair", 2 * image.size, dtype)
+        for place, mirrored in enumerate((False, True)):
+            flat = queue.upload("in", image)
+            inputs_cuda.take(queue, flat, np.dtype(dtype), out, place, 1, mirrored, shape)
+        np.testing.assert_array_equal(queue.fetch(out).reshape(2, *shape), [image, image[:, ::-1]])
+
+
+def check_flipped(queue):
+    for height, width in SHAPES:
+        image = np.random.default_rng(0).normal(size=(height, width)).astype(np.float32)
+        out = queue.array("out", image.size, np.float32)
+        blocks = inputs_cuda.blocks_for(image.size, inputs_cuda.flip.block)
+        queue.launch(inputs_cuda.flip, blocks, queue.upload("in", image), out, height, width)
+        np.testing.assert_array_equal(queue.fetch(out).reshape(image.shape), image[:, ::-1])
+
+
+def check_halved(queue, dtype=np.uint8):
+    for shape in SHAPES:
+        pair = _pair(shape, dtype)
+        bad = np.random.default_rng(1).random((2, *shape)) < 0.2
+        want = inputs.half_size(inputs.GrayPair(*pair, *bad, pair[0].astype(np.uint8)))
+        half = queue.upload("in", pair)
+        out = inputs_cuda.halve(queue, "half", half, np.dtype(dtype), 2, shape, False)
+        np.testing.assert_array_equal(queue.fetch(out).reshape(2, *want.left.shape), [want.left, want.right])
+        masks = queue.upload("bad", bad.view(np.uint8))
+        out = inputs_cuda.halve(queue, "half.bad", masks, np.dtype(np.uint8), 2, shape, True)
+        found = queue.fetch(out).reshape(2, *want.left.shape)
+        np.testing.assert_array_equal(found != 0, [want.left_bad, want.right_bad])
+
+
+def check_blurred(queue, dtype=np.uint8, sigmas=(0.3, 0.7, 2.0)):
+    for shape, sigma in zip(SHAPES, sigmas, strict=True):
+        pair = _pair(shape, dtype)
+        want = inputs.smooth(inputs.GrayPair(*pair, None, None, pair[0].astype(np.uint8)), sigma)
+        out = inputs_cuda.smooth(queue, queue.upload("in", pair), np.dtype(dtype), sigma, shape)
+        np.testing.assert_array_equal(queue.fetch(out).reshape(2, *shape), [want.left, want.right])
+
+
+def check_ranges(queue, dtype=np.uint8):
+    for shape in ((1, 1), (19, 33), (130, 70)):
+        pair = _pair(shape, dtype)
+        out = inputs_cuda.ranges(queue, queue.upload("in", pair), np.dtype(dtype), pair[0].size)
+        want = [pair[0].min(), pair[0].max(), pair[1].min(), pair[1].max()]
+        np.testing.assert_array_equal(queue.fetch(out), want)

@@ -1,0 +1,111 @@
+"""Path costs with selection, and selection alone, on a queue, against the CPU: equal to the last bit."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from stereokit.aggregation import sgm_cuda
+from stereokit.aggregation.sgm import Sgm
+from stereokit.costs import Census
+from stereokit.costs.rows import Levels, VolumeRows
+from stereokit.costs.rows_cuda import pad_levels
+from stereokit.kernels.workspace import Workspace
+from stereokit.selection import wta_cuda
+from stereokit.selection.wta import keys_of, select_row, winners_like
+
+LOWEST = -3
+
+
+def _maps(queue: Any, pixels: int, floats: bool, count: int, subpixel: bool, uniqueness: float, confident: bool) -> Any:
+    return wta_cuda.Maps(
+        queue.array("disparity", pixels, np.float32),
+        queue.array("cost", pixels, np.float32 if floats else np.uint16),
+        queue.array("confidence", pixels if confident else 1, np.float32),
+        count,
+        LOWEST,
+        int(subpixel),
+        np.float32(uniqueness / 100),
+        int(confident),
+    )
+
+
+def _compare(queue: Any, maps: Any, disparity: np.ndarray, cost: np.ndarray, confidence: np.ndarray | None) -> None:
+    np.testing.assert_array_equal(queue.fetch(maps.disparity), disparity.ravel())
+    np.testing.assert_array_equal(queue.fetch(maps.cost), cost.ravel())
+    if confidence is not None:
+        np.testing.assert_array_equal(queue.fetch(maps.confidence), confidence.ravel())
+
+
+def check_paths(
+    queue: Any, sgm: Sgm, shape: tuple[int, int], count: int, subpixel: bool = True, uniqueness: float = 0.0,
+    confident: bool = True,
+) -> None:  # fmt: skip
+    """Compare the maps of random costs with a patch of equal ones, on a guide with edges."""
+    rng = np.random.default_rng(0)
+    cost = Census("5x5")
+    costs = rng.integers(0, cost.cost_max + 1, (*shape, count)).astype(np.uint8)
+    costs[1:4, 2:7] = 4
+    guide = np.repeat(rng.integers(0, 30, shape), 3, axis=1)[:, : shape[1]].astype(np.uint8)
+    levels = Levels(0, count)
+    disparity, confidence = np.empty((2, *shape), np.float32)
+    total = np.empty(shape, np.uint16)
+    out = winners_like(disparity, total, confidence if confident else None, count, LOWEST, subpixel, uniqueness)
+    sgm.sweep([VolumeRows(costs, levels.padded)] * 2, levels, cost, guide, Workspace(), 1, out)
+    padded = pad_levels(count)
+    volume = np.full((*shape, padded), 255, np.uint8)
+    volume[:, :, :count] = costs
+    maps = _maps(queue, disparity.size, False, count, subpixel, uniqueness, confident)
+    words = queue.upload("costs", volume.view(np.uint32))
+    sgm_cuda.aggregate(queue, sgm, cost, words, queue.upload("guide", guide), shape, padded, maps)
+    _compare(queue, maps, disparity, total, confidence if confident else None)
+
+
+def check_four_paths(queue):
+    check_paths(queue, Sgm(15, 85, paths=4), (5, 9), 8)
+
+
+def check_eight_paths(queue):
+    check_paths(queue, Sgm(15, 85, paths=8), (6, 5), 40, uniqueness=4.0, confident=False)
+
+
+def check_selection(
+    queue: Any, floats: bool = False, shape: tuple[int, int] = (3, 7), count: int = 10, subpixel: bool = True,
+    uniqueness: float = 3.0, confident: bool = True, bands: tuple[int, ...] = (0, 4, 7),
+) -> None:  # fmt: skip
+    """Compare selection from a random volume, in bands of columns, with ties and a pixel of zeros."""
+    rng = np.random.default_rng(0)
+    dtype = np.float32 if floats else np.uint16
+    height, width = shape
+    padded = pad_levels(count)
+    volume = np.full((height, width, padded), 60000, dtype)
+    volume[:, :, :count] = rng.integers(0, 50, (height, width, count)) * (0.37 if floats else 1)
+    volume[0, 0, :count] = 0
+    whole = -(-padded // 64) * 64
+    values = np.full((height, width, whole), 60000, dtype)
+    values[:, :, :padded] = volume
+    disparity, confidence = np.empty((2, *shape), np.float32)
+    cost = np.empty(shape, dtype)
+    out = winners_like(disparity, cost, confidence if confident else None, count, LOWEST, subpixel, uniqueness)
+    for y in range(height):
+        row = values[y].ravel()
+        select_row(keys_of(row), row, width, tuple(range(whole // 64)), y * width, out)
+    maps = _maps(queue, cost.size, floats, count, subpixel, uniqueness, confident)
+    for first, end in itertools.pairwise(bands):
+        part = queue.upload("totals", np.ascontiguousarray(volume[:, first:end]))
+        wta_cuda.select(queue, part, floats, first, end - first, shape, padded, maps)
+    _compare(queue, maps, disparity, cost, confidence if confident else None)
+
+
+def check_selection_of_floats(queue):
+    check_selection(queue, floats=True)
+
+
+def check_doubt(queue):
+    confidence = np.linspace(0, 1, 200, dtype=np.float32)
+    valid = (np.arange(200) % 3 != 0).astype(np.uint8)
+    held = queue.upload("confidence", confidence)
+    queue.launch(wta_cuda.doubt, 2, held, queue.upload("valid", valid), confidence.size)
+    np.testing.assert_array_equal(queue.fetch(held), confidence * valid)

@@ -1,0 +1,137 @@
+"""Whole matches through the interpreter: ``device="cuda"`` gives the CPU's maps, in every pixel and bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba_cuda")
+
+from ptx.emulated import EmulatedQueue
+from stereokit import Matcher, matching, pipeline_cuda
+from stereokit.errors import DeviceError, InputError
+
+LEVELS = {"max_disparity": 14, "threads": 1}
+
+
+class _Queue(EmulatedQueue):
+    """A queue whose copies are kept, as those of a caller are."""
+
+    copies = 0
+
+    def copy(self, held: Any) -> Any:
+        self.copies += 1
+        return self.upload(f"copy {self.copies}", held.values)
+
+
+@pytest.fixture
+def queues(monkeypatch):
+    """Make the matcher believe in a GPU whose launches go to the interpreter; return its queues."""
+    made: list[_Queue] = []
+
+    def new_queue(stream: Any) -> _Queue:
+        made.append(_Queue())
+        return made[-1]
+
+    monkeypatch.setattr(pipeline_cuda, "new_queue", new_queue)
+    monkeypatch.setattr(matching, "require_device", lambda: None)
+    return made
+
+
+def _pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return a textured plane four pixels off, with a patch that matches nothing and a flat one."""
+    rng = np.random.default_rng(seed)
+    left = rng.integers(0, 256, (height, width), dtype=np.uint8)
+    right = np.roll(left, -4, axis=1)
+    left[2:5, width // 2 : width // 2 + 9] = rng.integers(0, 256, (3, 9))
+    left[-3:, 5:12] = 90
+    return left, right
+
+
+def _same(left: Any, right: Any, method: str, /, **options: Any) -> None:
+    want = Matcher(method, device="cpu", **LEVELS, **options)(left, right)
+    matcher = Matcher(method, device="cuda", **LEVELS, **options)
+    assert matcher.device == "cuda"
+    found = matcher(left, right)
+    for name in ("disparity", "valid", "confidence", "right"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(want, name), name)
+    assert found.valid.any()
+
+
+@pytest.mark.parametrize("method", ["S1", "S2", "S3", "S4"])
+def test_the_four_matchers(queues, method):
+    _same(*_pair(11, 35), method, confidence=True)
+    assert len(queues) == 1
+
+
+def test_nan_half_size_and_the_right_view(queues):
+    left, right = (image.astype(np.float32) + 0.25 for image in _pair(13, 40))
+    left[3, 4:7] = np.nan
+    right[8, 20] = np.inf
+    _same(left, right, "S2", scale=0.5, right=True, speckle=0.02, fill="background", paths=8)
+
+
+def test_what_is_left_out(queues):
+    left, right = _pair(7, 24)
+    _same(left, right, "S2", smooth=0, smp=False, speckle=0, fill=None, median=0, subpixel=False, uniqueness=10)
+
+
+def test_blank_images(queues):
+    blank = np.full((4, 9), 7, np.uint8)
+    matcher = Matcher("S4", device="cuda", **LEVELS)
+    want = Matcher("S4", device="cpu", **LEVELS)(blank, blank)
+    np.testing.assert_array_equal(matcher(blank, blank).disparity, want.disparity)
+
+
+def test_one_queue_serves_call_after_call_and_sizes(queues):
+    matcher = Matcher("S2", device="cuda", **LEVELS)
+    host = Matcher("S2", device="cpu", **LEVELS)
+    for shape in ((6, 24), (5, 20)):
+        pair = _pair(*shape)
+        np.testing.assert_array_equal(matcher(*pair).disparity, host(*pair).disparity)
+    assert len(queues) == 1
+
+
+def test_costs_without_a_twin_are_refused(queues):
+    with pytest.raises(DeviceError, match="window of zncc must be at most 11 on device 'cuda', got 13"):
+        Matcher("S4", device="cuda", window=13)
+    assert Matcher("S4", device="cpu", window=13).device == "cpu"
+
+
+def test_images_of_the_device(queues, monkeypatch):
+    def from_device(name: str, image: Any) -> Any:
+        channels = 1 if image.ndim == 2 else 3
+        return pipeline_cuda._Image(np.ascontiguousarray(image).ravel(), image.dtype, channels, image.shape[:2])
+
+    monkeypatch.setattr(pipeline_cuda, "_from_device", from_device)
+    monkeypatch.setattr(pipeline_cuda, "stream_of", lambda stream: stream)
+    monkeypatch.setattr(pipeline_cuda, "_reshaped", lambda held, shape: held.values.reshape(shape))
+    left, right = (np.repeat(image[:, :, None], 3, axis=2) for image in _pair(8, 26))
+    options = {**LEVELS, "right": True, "confidence": True}
+    found = Matcher("S2", device="cuda", **options).on_device(left, right, stream=0)
+    want = Matcher("S2", device="cpu", **options)(left, right)
+    np.testing.assert_array_equal(found.disparity, want.disparity)
+    np.testing.assert_array_equal(found.valid != 0, want.valid)
+    np.testing.assert_array_equal(found.confidence, want.confidence)
+    np.testing.assert_array_equal(found.right, want.right)
+
+
+def test_images_of_the_device_must_be_what_kernels_take(queues):
+    matcher = Matcher("S2", device="cuda", **LEVELS)
+    image = np.zeros((4, 9), np.uint8)
+    with pytest.raises(InputError, match="must both lie on the device or both on the host, but left does not"):
+        matcher.on_device(image, image)
+    with pytest.raises(DeviceError, match=r"scale must be 1 for images on the device, got 0\.5"):
+        Matcher("S2", device="cuda", scale=0.5).on_device(image, image)
+    with pytest.raises(DeviceError, match="device must be 'cuda' for images on the device, got 'cpu'"):
+        Matcher("S2", device="cpu").on_device(image, image)
+
+
+def test_volumes_beyond_the_index_are_refused(queues, monkeypatch):
+    matcher = Matcher("S2", device="cuda", max_disparity=2048)
+    image = np.zeros((3000, 3000), np.uint8)
+    monkeypatch.setattr(_Queue, "launch", lambda *_: None)
+    with pytest.raises(DeviceError, match=r"levels of all pixels must be fewer than 2\*\*34 on the device"):
+        matcher(image, image)

@@ -1,0 +1,46 @@
+"""The kernels of semi-global matching, executed from their PTX."""
+
+from __future__ import annotations
+
+import pytest
+
+from ptx import bodies_sgm as bodies
+from ptx.emulated import EmulatedQueue
+from stereokit.aggregation.sgm import Sgm
+from stereokit.aggregation.sgm_cuda import directions
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2, 3])
+@pytest.mark.parametrize("check", [bodies.check_four_paths, bodies.check_eight_paths])
+def test_schedules(check, seed):
+    check(EmulatedQueue(seed))
+
+
+@pytest.mark.parametrize("paths", [4, 5, 8])
+def test_paths(paths):
+    bodies.check_paths(EmulatedQueue(), Sgm(15, 85, paths=paths), (9, 33), 8)
+
+
+@pytest.mark.parametrize(
+    ("shape", "count"),
+    [((1, 1), 1), ((1, 7), 2), ((7, 1), 33), ((3, 5), 64), ((4, 3), 65), ((3, 3), 129), ((2, 3), 385)],
+)
+def test_sizes_and_levels(shape, count):
+    bodies.check_paths(EmulatedQueue(), Sgm(15, 85, paths=8), shape, count)
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0])
+def test_penalties_follow_the_edges(factor):
+    bodies.check_paths(EmulatedQueue(), Sgm(10, 60, edge=5, edge_factor=factor), (4, 12), 12, subpixel=False)
+
+
+def test_largest_path_costs():
+    bodies.check_paths(EmulatedQueue(), Sgm(231, 231, paths=8, edge_factor=1), (4, 6), 20)
+
+
+def test_the_last_direction_runs_along_a_column_and_none_comes_twice():
+    for paths in (4, 5, 8):
+        steps = directions(paths)
+        assert len(set(steps)) == len(steps) == paths
+        assert steps[-1][0] == 0
+    assert all(dy >= 0 for _, dy in directions(5))

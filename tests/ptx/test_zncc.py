@@ -1,0 +1,51 @@
+"""The kernels of the ZNCC costs, executed from their PTX."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ptx import bodies_costs as bodies
+from ptx.emulated import EmulatedQueue
+from stereokit.costs import Zncc
+from stereokit.costs.rows import Levels
+from stereokit.costs.zncc_cuda import LARGEST_WINDOW, check_window
+from stereokit.errors import DeviceError
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2, 3])
+def test_two_strips(seed):
+    bodies.check_zncc(EmulatedQueue(seed))
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2, 3])
+def test_masks_and_border_pixels(seed):
+    bodies.check_zncc_with_masks(EmulatedQueue(seed))
+
+
+@pytest.mark.parametrize("window", range(3, LARGEST_WINDOW + 1, 2))
+def test_windows(window):
+    bodies.check_volume(EmulatedQueue(), Zncc(window), (6, 33), Levels(0, 8), dtype=np.uint16)
+
+
+@pytest.mark.parametrize(
+    ("shape", "levels", "outside"),
+    [
+        ((1, 1), Levels(0, 1), 0.5),
+        ((3, 2), Levels(-70, 40), 1.0),
+        ((4, 65), Levels(3, 33), None),
+        ((2, 31), Levels(60, 129), 0.0),
+    ],
+)
+def test_sizes_and_levels(shape, levels, outside):
+    bodies.check_volume(EmulatedQueue(), Zncc(5), shape, levels, outside)
+
+
+def test_windows_of_larger_images_take_the_range_of_the_whole():
+    ranges = ((5, 240), (20, 300))
+    bodies.check_volume(EmulatedQueue(), Zncc(5), (5, 23), Levels(0, 8), ranges=ranges)
+
+
+def test_a_window_that_no_register_holds_is_refused():
+    with pytest.raises(DeviceError, match="window of zncc must be at most 11 on device 'cuda', got 13"):
+        check_window(Zncc(13))

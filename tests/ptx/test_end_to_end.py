@@ -66,6 +66,17 @@ def test_the_four_matchers(queues, method):
     assert len(queues) == 1
 
 
+@pytest.mark.parametrize("options", [{"mode": "sum"}, {"passes": 2, "sigma_s": 3, "sigma_v": 2}], ids=["sum", "rf"])
+@pytest.mark.parametrize("shape", [(1, 40), (12, 31)])
+def test_the_domain_transform(queues, shape, options):
+    _same(*_pair(*shape) if shape[0] > 1 else _flat_row(shape[1]), "S1", confidence=True, **options)
+
+
+def _flat_row(width: int) -> tuple[np.ndarray, np.ndarray]:
+    left = np.random.default_rng(1).integers(0, 256, (1, width), dtype=np.uint8)
+    return left, np.roll(left, -4, axis=1)
+
+
 def test_nan_half_size_and_the_right_view(queues):
     left, right = (image.astype(np.float32) + 0.25 for image in _pair(13, 40))
     left[3, 4:7] = np.nan

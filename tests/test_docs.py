@@ -78,6 +78,8 @@ def folder(street, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     stereokit.io.write_image("left.png", street.left)
     stereokit.io.write_image("right.png", street.right)
+    np.save("left.npy", street.left)
+    np.save("right.npy", street.right)
     (tmp_path / "camera.json").write_text('{"fx": 180, "fy": 180, "cx0": 155, "cy": 43, "baseline_m": 0.2}')
     (tmp_path / "mine").mkdir()
     shutil.copy(CARD.with_name("cnn.safetensors"), tmp_path / "mine" / "weights.safetensors")

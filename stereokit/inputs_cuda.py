@@ -20,6 +20,7 @@ from stereokit.kernels.cuda import (
     Kernel,
     Queue,
     array,
+    blocks_for,
     cuda,
     device,
     f32,
@@ -34,7 +35,6 @@ from stereokit.kernels.cuda import (
 
 __all__ = [
     "KINDS",
-    "blocks_for",
     "clamped",
     "flip",
     "gaussian_weights",
@@ -49,11 +49,6 @@ KINDS = {np.dtype(np.uint8): u8, np.dtype(np.uint16): u16}
 
 _PARTS = 32
 """Blocks that look at one image for its range: as many as a warp has lanes."""
-
-
-def blocks_for(threads: int, block: int) -> int:
-    """Return how many blocks make up at least so many threads."""
-    return -(-threads // block)
 
 
 @device

@@ -27,8 +27,8 @@ from stereokit.costs.rows_cuda import Scene
 from stereokit.costs.zncc import Zncc
 from stereokit.errors import DeviceError, InputError
 from stereokit.inputs import GrayPair
-from stereokit.inputs_cuda import blocks_for, flip, halve, smooth, take
-from stereokit.kernels.cuda import Queue, cuda
+from stereokit.inputs_cuda import flip, halve, smooth, take
+from stereokit.kernels.cuda import Queue, blocks_for, cuda
 from stereokit.kernels.queue_cuda import DeviceQueue, stream_of
 from stereokit.postprocess.chain import Chain
 from stereokit.postprocess.chain_cuda import post_process

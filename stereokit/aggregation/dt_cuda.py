@@ -24,8 +24,21 @@ from stereokit.aggregation._lines_cuda import SEGMENT, bands, marks_of, weights
 from stereokit.aggregation.dt import Dt
 from stereokit.aggregation.dt_sum_cuda import aggregate_sum
 from stereokit.costs.rows import Cost
-from stereokit.inputs_cuda import blocks_for
-from stereokit.kernels.cuda import Kernel, Queue, array, cuda, device, f32, i16, i32, kernel, store2, u16, u32
+from stereokit.kernels.cuda import (
+    Kernel,
+    Queue,
+    array,
+    blocks_for,
+    cuda,
+    device,
+    f32,
+    i16,
+    i32,
+    kernel,
+    store2,
+    u16,
+    u32,
+)
 from stereokit.selection.wta_cuda import RULES, Maps, select, selector
 
 __all__ = ["aggregate"]
@@ -129,32 +142,66 @@ def _weight_back(weights, start, step, n, count):  # type: ignore[no-untyped-def
     return weight
 
 
+def _walker(finish: Any) -> Any:
+    """Return the helper that walks a line there and back.
+
+    On the way back it hands every pixel to ``finish(state, n, target)``, from the last to the first; `n` may lie past
+    the line's end, and `target` is whatever the kernel gave for it.
+    """
+
+    @device
+    def walk(volume, weights, marks, thread, threads, start, step, count, quad, quads, fraction, target):  # type: ignore[no-untyped-def]
+        segment = _leave_marks(volume, weights, marks, thread, threads, start, step, count, quad, quads, fraction)
+        held = cuda.local.array(_HELD, u32)
+        state = i32(0), i32(0), i32(0), i32(0)
+        more = True
+        while more:
+            _walk_again(
+                volume, weights, marks, held, thread, threads, start, step, count, quad, quads, fraction, segment
+            )
+            for j in range(SEGMENT):
+                k = SEGMENT - 1 - j
+                n = u32(segment + u32(k))
+                state = _step_back(state, held, k, _weight_back(weights, start, step, n, count))
+                finish(state, n, target)
+            more = segment > u32(0)
+            segment = u32(segment - u32(SEGMENT))
+
+    return walk
+
+
+@device
+def _keep_bytes(state, n, target):  # type: ignore[no-untyped-def]
+    volume, start, step, count, quad, quads, shift = target
+    if n < count:
+        low = u32(_pack(state[0], shift, 0) | _pack(state[1], shift, 1))
+        high = u32(_pack(state[2], shift, 2) | _pack(state[3], shift, 3))
+        volume[u32(u32(u32(start + u32(n * step)) * quads) + quad)] = u32(low | high)
+
+
+@device
+def _keep_totals(state, n, target):  # type: ignore[no-untyped-def]
+    totals, thread, threads, count = target
+    if n < count:
+        to = u32(u32(n * threads) + thread)
+        store2(totals, u32(to * u32(2)), (_pair(state[0], state[1]), _pair(state[2], state[3])))
+
+
+_walk_bytes = _walker(_keep_bytes)
+_walk_totals = _walker(_keep_totals)
+
+
 @kernel(array(u32), array(i16), array(u32), *[u32] * 5, i32, i32)
 def dt_walk_bytes(volume, weights, marks, lines, count, pitch, step, quads, fraction, shift):  # type: ignore[no-untyped-def]
     """Filter lines in place; pixel n of line k is ``k * pitch + n * step``."""
     thread = u32(cuda.grid(1))
     threads = u32(lines * quads)
-    if thread >= threads:
-        return
-    line = u32(thread // quads)
-    quad = u32(thread - u32(line * quads))
-    start = u32(line * pitch)
-    segment = _leave_marks(volume, weights, marks, thread, threads, start, step, count, quad, quads, fraction)
-    held = cuda.local.array(_HELD, u32)
-    state = i32(0), i32(0), i32(0), i32(0)
-    more = True
-    while more:
-        _walk_again(volume, weights, marks, held, thread, threads, start, step, count, quad, quads, fraction, segment)
-        for j in range(SEGMENT):
-            k = SEGMENT - 1 - j
-            n = u32(segment + u32(k))
-            state = _step_back(state, held, k, _weight_back(weights, start, step, n, count))
-            if n < count:
-                low = u32(_pack(state[0], shift, 0) | _pack(state[1], shift, 1))
-                high = u32(_pack(state[2], shift, 2) | _pack(state[3], shift, 3))
-                volume[u32(u32(u32(start + u32(n * step)) * quads) + quad)] = u32(low | high)
-        more = segment > u32(0)
-        segment = u32(segment - u32(SEGMENT))
+    if thread < threads:
+        line = u32(thread // quads)
+        quad = u32(thread - u32(line * quads))
+        start = u32(line * pitch)
+        target = volume, start, step, count, quad, quads, shift
+        _walk_bytes(volume, weights, marks, thread, threads, start, step, count, quad, quads, fraction, target)
 
 
 @kernel(array(u32), array(i16), array(u32), array(u32), *[u32] * 5, i32)
@@ -162,26 +209,12 @@ def dt_walk_totals(volume, weights, marks, totals, height, width, x0, band, quad
     """Filter the columns x0 to x0 + band into ``(height, band, 4 * quads)`` totals of 16 bits."""
     thread = u32(cuda.grid(1))
     threads = u32(band * quads)
-    if thread >= threads:
-        return
-    line = u32(thread // quads)
-    quad = u32(thread - u32(line * quads))
-    start = u32(x0 + line)
-    segment = _leave_marks(volume, weights, marks, thread, threads, start, width, height, quad, quads, fraction)
-    held = cuda.local.array(_HELD, u32)
-    state = i32(0), i32(0), i32(0), i32(0)
-    more = True
-    while more:
-        _walk_again(volume, weights, marks, held, thread, threads, start, width, height, quad, quads, fraction, segment)
-        for j in range(SEGMENT):
-            k = SEGMENT - 1 - j
-            y = u32(segment + u32(k))
-            state = _step_back(state, held, k, _weight_back(weights, start, width, y, height))
-            if y < height:
-                to = u32(u32(y * threads) + thread)
-                store2(totals, u32(to * u32(2)), (_pair(state[0], state[1]), _pair(state[2], state[3])))
-        more = segment > u32(0)
-        segment = u32(segment - u32(SEGMENT))
+    if thread < threads:
+        line = u32(thread // quads)
+        quad = u32(thread - u32(line * quads))
+        start = u32(x0 + line)
+        target = totals, thread, threads, height
+        _walk_totals(volume, weights, marks, thread, threads, start, width, height, quad, quads, fraction, target)
 
 
 @cache
@@ -190,6 +223,18 @@ def select_kernel(padded: int) -> Kernel:
     quads = padded // 4
     choose = selector(padded, False)
     maps = array(f32), array(u16), array(f32), *RULES
+
+    @device
+    def keep_winner(state, n, target):  # type: ignore[no-untyped-def]
+        values, lane, start, alive, height, width, disparity, cost, confidence, rules = target
+        levels, minimum, subpixel, uniqueness, confident = rules
+        values[0], values[1], values[2], values[3] = state
+        choose(
+            values, lane, u32(start + u32(n * width)), alive and n < height, disparity, cost, confidence,
+            levels, minimum, subpixel, uniqueness, confident,
+        )  # fmt: skip
+
+    walk = _walker(keep_winner)
 
     @kernel(array(u32), array(i16), array(u32), u32, u32, i32, *maps, name=f"dt_walk_select_{padded}")
     def walk_select(  # type: ignore[no-untyped-def]
@@ -201,31 +246,12 @@ def select_kernel(padded: int) -> Kernel:
         threads = u32(cuda.gridsize(1))
         line = u32(thread // u32(quads))
         quad = u32(thread - u32(line * u32(quads)))
-        alive = line < width
         start = min(line, u32(width - u32(1)))
-        lane = i32(thread & u32(31))
-        segment = _leave_marks(
-            volume, weights, marks, thread, threads, start, width, height, quad, u32(quads), fraction
-        )
-        held = cuda.local.array(_HELD, u32)
         values = cuda.local.array(4, i32)
-        state = i32(0), i32(0), i32(0), i32(0)
-        more = True
-        while more:
-            _walk_again(
-                volume, weights, marks, held, thread, threads, start, width, height, quad, u32(quads), fraction, segment
-            )
-            for j in range(SEGMENT):
-                k = SEGMENT - 1 - j
-                y = u32(segment + u32(k))
-                state = _step_back(state, held, k, _weight_back(weights, start, width, y, height))
-                values[0], values[1], values[2], values[3] = state
-                choose(
-                    values, lane, u32(start + u32(y * width)), alive and y < height, disparity, cost, confidence,
-                    levels, minimum, subpixel, uniqueness, confident,
-                )  # fmt: skip
-            more = segment > u32(0)
-            segment = u32(segment - u32(SEGMENT))
+        rules = levels, minimum, subpixel, uniqueness, confident
+        lane = i32(thread & u32(31))
+        target = values, lane, start, line < width, height, width, disparity, cost, confidence, rules
+        walk(volume, weights, marks, thread, threads, start, width, height, quad, u32(quads), fraction, target)
 
     made: Kernel = walk_select
     return made

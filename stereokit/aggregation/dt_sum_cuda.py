@@ -14,8 +14,7 @@ import numpy as np
 
 from stereokit.aggregation._lines_cuda import SEGMENT, bands, marks_of, weights
 from stereokit.aggregation.dt import Dt
-from stereokit.inputs_cuda import blocks_for
-from stereokit.kernels.cuda import Queue, array, cuda, device, f32, kernel, u8, u32
+from stereokit.kernels.cuda import Queue, array, blocks_for, cuda, device, f32, kernel, u8, u32
 from stereokit.selection.wta_cuda import Maps, select
 
 __all__ = ["aggregate_sum"]
@@ -27,23 +26,54 @@ def _feed(value, before, weight):  # type: ignore[no-untyped-def]
     return cuda.libdevice.fadd_rn(value, cuda.libdevice.fmul_rn(weight, before))
 
 
+@device
+def _leave_marks(values, weights, marks, thread, threads, first, stride, start, step, count):  # type: ignore[no-untyped-def]
+    """Walk a line there but for its last segment, and return where that begins.
+
+    Its values lie at ``first + n * stride`` and their feedback at ``start + n * step``.
+    """
+    a = f32(0)
+    segment = u32(0)
+    while u32(segment + u32(SEGMENT)) < count:
+        for k in range(SEGMENT):
+            n = u32(segment + u32(k))
+            a = _feed(f32(values[u32(first + u32(n * stride))]), a, weights[u32(start + u32(n * step))])
+        marks[u32(u32(u32(segment // u32(SEGMENT)) * threads) + thread)] = a
+        segment = u32(segment + u32(SEGMENT))
+    return segment
+
+
+@device
+def _walk_again(values, weights, marks, held, thread, threads, first, stride, start, step, last, segment):  # type: ignore[no-untyped-def]
+    """Walk one segment there, from its mark, and hold what it computes; past `last` that one is repeated."""
+    a = f32(0)
+    if segment > u32(0):
+        a = marks[u32(u32(u32(u32(segment // u32(SEGMENT)) - u32(1)) * threads) + thread)]
+    for k in range(SEGMENT):
+        n = min(u32(segment + u32(k)), last)
+        a = _feed(f32(values[u32(first + u32(n * stride))]), a, weights[u32(start + u32(n * step))])
+        held[k] = a
+
+
+@device
+def _weight_back(weights, start, step, n, count):  # type: ignore[no-untyped-def]
+    """Return the feedback from pixel n + 1; none into the line's last pixel."""
+    weight = f32(0)
+    if u32(n + u32(1)) < count:
+        weight = weights[u32(start + u32(u32(n + u32(1)) * step))]
+    return weight
+
+
 @kernel(array(u8), array(f32), array(f32), u32, u32, u32, name="dt_sum_marks")
 def _sum_marks(costs, weights, marks, height, width, levels):  # type: ignore[no-untyped-def]
     """Walk all rows to the right and leave the marks; a thread owns one level of a row."""
     thread = u32(cuda.grid(1))
     threads = u32(height * levels)
-    if thread >= threads:
-        return
-    line = u32(thread // levels)
-    level = u32(thread - u32(line * levels))
-    a = f32(0)
-    segment = u32(0)
-    while u32(segment + u32(SEGMENT)) < width:
-        for k in range(SEGMENT):
-            pixel = u32(u32(line * width) + u32(segment + u32(k)))
-            a = _feed(f32(costs[u32(u32(pixel * levels) + level)]), a, weights[pixel])
-        marks[u32(u32(u32(segment // u32(SEGMENT)) * threads) + thread)] = a
-        segment = u32(segment + u32(SEGMENT))
+    if thread < threads:
+        line = u32(thread // levels)
+        start = u32(line * width)
+        first = u32(u32(start * levels) + u32(thread - u32(line * levels)))
+        _leave_marks(costs, weights, marks, thread, threads, first, levels, start, u32(1), width)
 
 
 @kernel(array(u8), array(f32), array(f32), array(f32), array(f32), *[u32] * 5, name="dt_sum_rows")
@@ -56,6 +86,7 @@ def _sum_rows(costs, weights, marks, state, out, height, width, x0, band, levels
     line = u32(thread // levels)
     level = u32(thread - u32(line * levels))
     start = u32(line * width)
+    first = u32(u32(start * levels) + level)
     end = u32(x0 + band)
     last = u32(end - u32(1))
     b = f32(0)
@@ -65,21 +96,12 @@ def _sum_rows(costs, weights, marks, state, out, height, width, x0, band, levels
     segment = u32(x0 + u32(u32(u32(band - u32(1)) // u32(SEGMENT)) * u32(SEGMENT)))
     more = True
     while more:
-        a = f32(0)
-        if segment > u32(0):
-            a = marks[u32(u32(u32(u32(segment // u32(SEGMENT)) - u32(1)) * threads) + thread)]
-        for k in range(SEGMENT):
-            pixel = u32(start + min(u32(segment + u32(k)), last))
-            a = _feed(f32(costs[u32(u32(pixel * levels) + level)]), a, weights[pixel])
-            held[k] = a
+        _walk_again(costs, weights, marks, held, thread, threads, first, levels, start, u32(1), last, segment)
         for j in range(SEGMENT):
             k = SEGMENT - 1 - j
             x = u32(segment + u32(k))
             if x <= last:
-                weight = f32(0)
-                if u32(x + u32(1)) < width:
-                    weight = weights[u32(u32(start + x) + u32(1))]
-                b = _feed(held[k], b, weight)
+                b = _feed(held[k], b, _weight_back(weights, start, u32(1), x, width))
                 out[u32(u32(u32(u32(line * band) + u32(x - x0)) * levels) + level)] = b
         more = segment > x0
         segment = u32(segment - u32(SEGMENT))
@@ -93,36 +115,19 @@ def _sum_columns(totals, weights, marks, height, width, x0, band, levels):  # ty
     threads = u32(band * levels)
     if thread >= threads:
         return
-    line = u32(thread // levels)
-    start = u32(x0 + line)
+    start = u32(x0 + u32(thread // levels))
     last = u32(height - u32(1))
-    a = f32(0)
-    segment = u32(0)
-    while u32(segment + u32(SEGMENT)) < height:
-        for k in range(SEGMENT):
-            y = u32(segment + u32(k))
-            a = _feed(totals[u32(u32(y * threads) + thread)], a, weights[u32(start + u32(y * width))])
-        marks[u32(u32(u32(segment // u32(SEGMENT)) * threads) + thread)] = a
-        segment = u32(segment + u32(SEGMENT))
+    segment = _leave_marks(totals, weights, marks, thread, threads, thread, threads, start, width, height)
     held = cuda.local.array(SEGMENT, f32)
     b = f32(0)
     more = True
     while more:
-        a = f32(0)
-        if segment > u32(0):
-            a = marks[u32(u32(u32(u32(segment // u32(SEGMENT)) - u32(1)) * threads) + thread)]
-        for k in range(SEGMENT):
-            y = min(u32(segment + u32(k)), last)
-            a = _feed(totals[u32(u32(y * threads) + thread)], a, weights[u32(start + u32(y * width))])
-            held[k] = a
+        _walk_again(totals, weights, marks, held, thread, threads, thread, threads, start, width, last, segment)
         for j in range(SEGMENT):
             k = SEGMENT - 1 - j
             y = u32(segment + u32(k))
             if y <= last:
-                weight = f32(0)
-                if y < last:
-                    weight = weights[u32(start + u32(u32(y + u32(1)) * width))]
-                b = _feed(held[k], b, weight)
+                b = _feed(held[k], b, _weight_back(weights, start, width, y, height))
                 totals[u32(u32(y * threads) + thread)] = b
         more = segment > u32(0)
         segment = u32(segment - u32(SEGMENT))

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from stereokit.aggregation._paths import Penalties
 from stereokit.aggregation.sgm import Sgm
 from stereokit.costs.rows import Cost
-from stereokit.inputs_cuda import blocks_for
 from stereokit.kernels.cuda import (
     Kernel,
     Queue,
     array,
+    blocks_for,
     cuda,
     device,
     f32,
@@ -83,6 +83,18 @@ def _words_loader(words: int) -> Any:
 
 
 @cache
+def _finder(padded: int) -> Any:
+    """Return the helper that returns the first word of a lane of a group at a pixel."""
+    _, held = group_of(padded)
+
+    @device
+    def words_at(pixel, place):  # type: ignore[no-untyped-def]
+        return u64(u32(u32(pixel * u32(padded // 4)) + u32(place * i32(held // 4))))
+
+    return words_at
+
+
+@cache
 def _stepper(padded: int) -> Any:
     """Return the helper that takes a path one pixel further, in place; it returns the smallest path cost."""
     lanes, held = group_of(padded)
@@ -121,6 +133,7 @@ def paths_kernel(padded: int) -> Kernel:
     words = held // 4
     span = padded // 4
     lines_of_block = 128 // lanes
+    words_at = _finder(padded)
     load = _words_loader(words)
     step = _stepper(padded)
     types = array(u32), array(u8), array(i32), i32, array(u32), i32, i32
@@ -156,11 +169,11 @@ def paths_kernel(padded: int) -> Kernel:
             path[k] = i32(0)
         low = i32(0)
         at = u32(u32(u32(y) * u32(width)) + u32(x))
-        load(costs, u64(u32(u32(at * u32(span)) + u32(place * i32(words)))), coming)
+        load(costs, words_at(at, place), coming)
         grey = i32(guide[at])
         before = grey
         for _ in range(steps):
-            to = u64(u32(u32(at * u32(span)) + u32(place * i32(words))))
+            to = words_at(at, place)
             for j in range(words):
                 present[j] = coming[j]
             jump = i32(abs(i32(grey - before)))
@@ -171,7 +184,7 @@ def paths_kernel(padded: int) -> Kernel:
             if wrapped:
                 x = i32(x - width) if dx > 0 else i32(x + width)
             at = u32(u32(u32(y) * u32(width)) + u32(x))
-            load(costs, u64(u32(u32(at * u32(span)) + u32(place * i32(words)))), coming)
+            load(costs, words_at(at, place), coming)
             grey = i32(guide[at])
             small = p1_edge if jump >= edge else p1
             large = p2_edge if jump >= edge else p2
@@ -207,6 +220,7 @@ def final_kernel(padded: int, others: int) -> Kernel:
     words = held // 4
     span = padded // 4
     lines_of_block = 128 // lanes
+    words_at = _finder(padded)
     load = _words_loader(words)
     step = _stepper(padded)
     choose = selector(padded, False)
@@ -238,10 +252,10 @@ def final_kernel(padded: int, others: int) -> Kernel:
             path[k] = i32(0)
         low = i32(0)
         at = u32(u32(u32(y) * u32(width)) + u32(x))
-        load(costs, u64(u32(u32(at * u32(span)) + u32(place * i32(words)))), coming)
+        load(costs, words_at(at, place), coming)
         before = i32(guide[at])
         for n in range(others):
-            load(stored, u64(u32(u32(at * u32(span)) + u32(place * i32(words)))) + u64(n) * volume, part)
+            load(stored, words_at(at, place) + u64(n) * volume, part)
             for j in range(words):
                 ahead[n * words + j] = part[j]
         for _ in range(height):
@@ -259,7 +273,7 @@ def final_kernel(padded: int, others: int) -> Kernel:
                 total[4 * j + 3] = i32(high_sum >> u32(16))
             y = i32(min(max(i32(y + dy), i32(0)), i32(height - 1)))
             at = u32(u32(u32(y) * u32(width)) + u32(x))
-            source = u64(u32(u32(at * u32(span)) + u32(place * i32(words))))
+            source = words_at(at, place)
             load(costs, source, coming)
             for n in range(others):
                 load(stored, source + u64(n) * volume, part)

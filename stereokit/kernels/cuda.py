@@ -46,6 +46,7 @@ __all__ = [
     "Kernel",
     "Queue",
     "array",
+    "blocks_for",
     "cuda",
     "device",
     "f32",
@@ -146,6 +147,11 @@ def kernel(*signature: Any, block: int = 128, name: str | None = None) -> Callab
 def device(function: Callable[..., Any]) -> Any:
     """Compile `function` as a helper that is always inlined into the kernels that call it."""
     return cuda.jit(device=True, forceinline=True)(function)
+
+
+def blocks_for(threads: int, block: int) -> int:
+    """Return how many blocks make up at least so many threads."""
+    return -(-threads // block)
 
 
 class Queue(Protocol):

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.inputs_cuda import blocks_for
-from stereokit.kernels.cuda import FULL, Queue, array, cuda, f32, i32, kernel, u8, u32
+from stereokit.kernels.cuda import FULL, Queue, array, blocks_for, cuda, f32, i32, kernel, u8, u32
 from stereokit.postprocess.fill import gap_value
 
 __all__ = ["fill"]

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.inputs_cuda import blocks_for
 from stereokit.kernels.cuda import (
     FULL,
     Queue,
     array,
+    blocks_for,
     cuda,
     device,
     f32,

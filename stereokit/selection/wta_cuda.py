@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereokit.inputs_cuda import blocks_for
 from stereokit.kernels.cuda import (
     FULL,
     Kernel,
     Queue,
     array,
+    blocks_for,
     cuda,
     device,
     f32,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereokit import inputs, inputs_cuda
+from stereokit.kernels.cuda import blocks_for
 
 SHAPES = [(1, 1), (5, 33), (8, 7)]
 
@@ -40,7 +41,7 @@ def check_flipped(queue):
     for height, width in SHAPES:
         image = np.random.default_rng(0).normal(size=(height, width)).astype(np.float32)
         out = queue.array("out", image.size, np.float32)
-        blocks = inputs_cuda.blocks_for(image.size, inputs_cuda.flip.block)
+        blocks = blocks_for(image.size, inputs_cuda.flip.block)
         queue.launch(inputs_cuda.flip, blocks, queue.upload("in", image), out, height, width)
         np.testing.assert_array_equal(queue.fetch(out).reshape(image.shape), image[:, ::-1])
 

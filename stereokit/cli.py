@@ -28,7 +28,17 @@ from rich.table import Table
 from typer.core import TyperGroup
 
 from stereokit import commandline
-from stereokit.commandline import JsonOption
+from stereokit.commandline import (
+    DeviceOption,
+    FillOption,
+    JsonOption,
+    MaxDisparityOption,
+    MethodOption,
+    MinDisparityOption,
+    RefinerOption,
+    ScaleOption,
+    SettingsOption,
+)
 from stereokit.errors import InputError, OptionError, StereokitError
 
 if TYPE_CHECKING:
@@ -119,17 +129,15 @@ def match(
         Path,
         typer.Option("--output", "-o", metavar="FILE", help=".png (KITTI, x256), .pfm, .npy or .tiff."),
     ],
-    method: Annotated[str, typer.Option("--method", "-m", help="cost+aggregation, S1 to S4.")] = "zncc+sgm",
-    max_disparity: Annotated[int, typer.Option(help="Disparities searched end below this, pixels.")] = 128,
-    min_disparity: Annotated[int, typer.Option(help="Disparities searched start here, pixels.")] = 0,
-    scale: Annotated[float, typer.Option(help="Match at this size, such as 0.5.")] = 1.0,
-    refiner: Annotated[str | None, typer.Option(help="Brings a scaled map to full size; see list.")] = None,
-    fill: Annotated[str | None, typer.Option(help="Of invalid pixels: nearest, background, none.")] = None,
+    method: MethodOption = "zncc+sgm",
+    max_disparity: MaxDisparityOption = 128,
+    min_disparity: MinDisparityOption = 0,
+    scale: ScaleOption = 1.0,
+    refiner: RefinerOption = None,
+    fill: FillOption = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage, such as p1=10.")
-    ] = None,
+    device: DeviceOption = "auto",
+    settings: SettingsOption = None,
     color: Annotated[Path | None, typer.Option(metavar="FILE", help="Also a Turbo coloured picture.")] = None,
     right: Annotated[Path | None, typer.Option(metavar="FILE", help="Also the right view's map.")] = None,
     confidence: Annotated[
@@ -223,12 +231,7 @@ def match(
         "outputs": {name.removeprefix("--"): str(path) for name, path in outputs.items() if name != "--json"},
         "width": width,
         "height": height,
-        "method": matcher.method,
-        "max_disparity": matcher.max_disparity,
-        "min_disparity": matcher.min_disparity,
-        "scale": matcher.scale,
-        "refiner": matcher.refiner,
-        "device": matcher.device,
+        **commandline.described(matcher),
         "options": options,
         "density": result.density,
         "seconds": seconds,

@@ -9,17 +9,46 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stereokit.errors import OptionError
 
-__all__ = ["JsonOption", "check_fits_png", "check_json", "parse_settings", "write_json"]
+if TYPE_CHECKING:
+    from stereokit.matching import Matcher
+
+__all__ = [
+    "DeviceOption",
+    "FillOption",
+    "JsonOption",
+    "MaxDisparityOption",
+    "MethodOption",
+    "MinDisparityOption",
+    "RefinerOption",
+    "ScaleOption",
+    "SettingsOption",
+    "check_fits_png",
+    "check_json",
+    "described",
+    "parse_settings",
+    "write_json",
+]
 
 _OWN_OPTIONS = frozenset(  # not through --set
     "method max_disparity min_disparity scale refiner fill threads device right confidence".split()
 )
+MethodOption = Annotated[str, typer.Option("--method", "-m", help="cost+aggregation, S1 to S4.")]
+MaxDisparityOption = Annotated[int, typer.Option(help="Disparities searched end below this, pixels.")]
+MinDisparityOption = Annotated[int, typer.Option(help="Disparities searched start here, pixels.")]
+ScaleOption = Annotated[float, typer.Option(help="Match at this size, such as 0.5.")]
+RefinerOption = Annotated[str | None, typer.Option(help="Brings a scaled map to full size; see list.")]
+FillOption = Annotated[str | None, typer.Option(help="Of invalid pixels: nearest, background, none.")]
+DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+SettingsOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage, such as p1=10.")
+]
+"""Types of the parameters that commands which match have in common; the defaults are theirs."""
 JsonOption = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - prints it.")
 ]
@@ -101,6 +130,12 @@ def write_json(path: Path | None, content: dict[str, Any]) -> bool:
 
     write_bytes(path, text.encode())
     return False
+
+
+def described(matcher: Matcher) -> dict[str, Any]:
+    """Return what the reports of commands say of a matcher."""
+    names = ("method", "max_disparity", "min_disparity", "scale", "refiner", "device")
+    return {name: getattr(matcher, name) for name in names}
 
 
 def _value(text: str) -> int | float | bool | str | None:

@@ -19,7 +19,21 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from stereokit.commandline import JsonOption, check_fits_png, check_json, parse_settings, write_json
+from stereokit.commandline import (
+    DeviceOption,
+    FillOption,
+    JsonOption,
+    MaxDisparityOption,
+    MethodOption,
+    MinDisparityOption,
+    RefinerOption,
+    ScaleOption,
+    SettingsOption,
+    check_fits_png,
+    check_json,
+    parse_settings,
+    write_json,
+)
 from stereokit.errors import FileError, OptionError, StereokitError
 from stereokit.inputs import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, write_bytes
@@ -39,16 +53,14 @@ _SHOWN_ERRORS = 10
 def batch(
     inputs: Annotated[list[Path], typer.Argument(help="A folder, a list or a video; or two folders or two videos.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the maps, NAME.FORMAT.")],
-    method: Annotated[str, typer.Option("--method", "-m", help="cost+aggregation, S1 to S4.")] = "zncc+sgm",
-    max_disparity: Annotated[int, typer.Option(help="Disparities searched end below this, pixels.")] = 128,
-    min_disparity: Annotated[int, typer.Option(help="Disparities searched start here, pixels.")] = 0,
-    scale: Annotated[float, typer.Option(help="Match at this size, such as 0.5.")] = 1.0,
-    refiner: Annotated[str | None, typer.Option(help="Brings a scaled map to full size; see list.")] = None,
-    fill: Annotated[str | None, typer.Option(help="Of invalid pixels: nearest, background, none.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage, such as p1=10.")
-    ] = None,
+    method: MethodOption = "zncc+sgm",
+    max_disparity: MaxDisparityOption = 128,
+    min_disparity: MinDisparityOption = 0,
+    scale: ScaleOption = 1.0,
+    refiner: RefinerOption = None,
+    fill: FillOption = None,
+    device: DeviceOption = "auto",
+    settings: SettingsOption = None,
     file_format: Annotated[str, typer.Option("--format", help="png (KITTI), pfm, npy or tiff.")] = "png",
     color: Annotated[bool, typer.Option("--color", help="Also coloured pictures, in DIR/color.")] = False,
     pattern: Annotated[

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from stereokit import __version__
-from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
+from stereokit.commandline import DeviceOption, JsonOption, check_json, parse_settings, write_json
 from stereokit.errors import OptionError
 from stereokit.io import write_image
 from stereokit_evaluation._folders import make_folder
@@ -71,7 +71,7 @@ def evaluate(
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")] = None,
     max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    device: DeviceOption = "auto",
     color: Annotated[bool, typer.Option("--color/--gray", help="Images as stored, or grey.")] = False,
     count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
     error_maps: Annotated[Path | None, typer.Option(help="Write error maps to METHOD/NAME.png here.")] = None,

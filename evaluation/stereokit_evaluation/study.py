@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from stereokit import METHODS, __version__
-from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
+from stereokit.commandline import DeviceOption, JsonOption, check_json, parse_settings, write_json
 from stereokit.errors import OptionError
 from stereokit.io import check_output
 from stereokit.kernels.pool import available_threads
@@ -58,7 +58,7 @@ def study(
     max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
     count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
     threads: Annotated[int | None, typer.Option(help="Threads of the matchers.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    device: DeviceOption = "auto",
     repeats: Annotated[int, typer.Option(help="Timed calls for each frame; the median counts.")] = 3,
     with_peers: Annotated[bool, typer.Option("--peers/--no-peers", help="OpenCV's modes too.")] = True,
     train: Annotated[bool, typer.Option("--train", help="Train each refiner for each matcher first.")] = False,

@@ -12,7 +12,16 @@ import typer
 
 from stereokit import Matcher, __version__
 from stereokit.calibration import read_calibration
-from stereokit.commandline import JsonOption, check_json, parse_settings, write_json
+from stereokit.commandline import (
+    DeviceOption,
+    JsonOption,
+    MaxDisparityOption,
+    MinDisparityOption,
+    ScaleOption,
+    check_json,
+    parse_settings,
+    write_json,
+)
 from stereokit.errors import InputError, OptionError
 from stereokit.io import check_output, read_disparity, read_image, write_bytes
 from stereokit_evaluation import viewer
@@ -28,12 +37,12 @@ def view(
     right: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The .html file to write.")],
     method: Annotated[list[str] | None, typer.Option("--method", "-m", help="S1 to S4; may repeat.")] = None,
-    max_disparity: Annotated[int, typer.Option(help="Disparities searched end below this, pixels.")] = 128,
-    min_disparity: Annotated[int, typer.Option(help="Disparities searched start here, pixels.")] = 0,
-    scale: Annotated[float, typer.Option(help="Match at this size, such as 0.5.")] = 1.0,
+    max_disparity: MaxDisparityOption = 128,
+    min_disparity: MinDisparityOption = 0,
+    scale: ScaleOption = 1.0,
     refiner: Annotated[list[str] | None, typer.Option(help="For --scale 0.5; may repeat.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    device: DeviceOption = "auto",
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage; may repeat.")
     ] = None,

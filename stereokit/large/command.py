@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from stereokit.commandline import described
 from stereokit.large.matching import OVERLAP, match_large
 
 __all__ = ["match_in_windows"]
@@ -60,12 +61,7 @@ def match_in_windows(
         "outputs": {"output": str(output)},
         "width": result.width,
         "height": result.height,
-        "method": matcher.method,
-        "max_disparity": matcher.max_disparity,
-        "min_disparity": matcher.min_disparity,
-        "scale": matcher.scale,
-        "refiner": matcher.refiner,
-        "device": matcher.device,
+        **described(matcher),
         "memory": memory,
         "overlap": result.overlap,
         "windows": result.windows,

@@ -6,7 +6,7 @@
 
 from stereokit.calibration import Calibration
 from stereokit.costs import Census, RowCost, Zncc
-from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
+from stereokit.errors import DeviceError, FileError, InputError, OptionError, StereokitError, UnknownNameError
 from stereokit.io import read_disparity, read_image, write_disparity
 from stereokit.large import LargeResult, match_large
 from stereokit.matching import METHODS, Matcher, match, warmup
@@ -22,6 +22,7 @@ __all__ = [
     "REFINERS",
     "Calibration",
     "Census",
+    "DeviceError",
     "Disparity",
     "FileError",
     "InputError",

@@ -15,6 +15,8 @@ import io
 import os
 import re
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ __all__ = [
     "from_opencv",
     "read_disparity",
     "read_image",
+    "replacing",
     "to_opencv",
     "write_bytes",
     "write_disparity",
@@ -80,8 +83,9 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = (), n
     return target
 
 
-def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write `data` to `path`, all of it or nothing.
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path beside `path`; what is written there gets that name when the block ends well.
 
     Raises
     ------
@@ -94,13 +98,25 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp"
     try:
         try:
-            temporary.write_bytes(data)
+            yield temporary
             os.replace(temporary, target)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
     except OSError as error:
         raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write `data` to `path`, all of it or nothing.
+
+    Raises
+    ------
+    FileError
+        If the folder is missing or the file cannot be written. An existing file is then left as it was.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def make_folder(name: str, path: str | os.PathLike[str]) -> None:

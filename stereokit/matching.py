@@ -134,8 +134,8 @@ class Matcher:
         if self.scale == 0.5:
             self.refiner, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
             self._refine = factory(**{k: options[k] for k in refiner_options if k in options})
-        self._needs_confidence = bool(getattr(self._refine, "needs_confidence", False))
         self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
+        self._confident = self.confidence or bool(getattr(self._refine, "needs_confidence", False))  # while matching
         self._pool = Pool()
         self.device = "cpu"
         self._cuda: CudaPipeline | None = None
@@ -147,7 +147,7 @@ class Matcher:
 
         settings = Settings(
             self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
-            self.uniqueness, self.confidence or self._needs_confidence, self.right, self.smp, self.speckle, self.fill,
+            self.uniqueness, self._confident, self.right, self.smp, self.speckle, self.fill,
             self.median,
         )  # fmt: skip
         try:
@@ -343,7 +343,7 @@ class Matcher:
         )
         disparity = workspace.array("match.disparity", shape, np.float32)
         cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
-        confidence = np.empty(shape, np.float32) if self.confidence or self._needs_confidence else None
+        confidence = np.empty(shape, np.float32) if self._confident else None
         out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness)
         self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, threads, out)
         chain = Chain(self.smp, int(self.speckle * disparity.size), self.fill, self.median, low)

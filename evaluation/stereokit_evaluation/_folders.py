@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stereokit import io
 from stereokit.errors import FileError
 
 __all__ = ["check_folder", "make_folder"]
@@ -30,8 +31,5 @@ def make_folder(place: Path, name: str = "output") -> Path:
     FileError
         If it cannot be made.
     """
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{name} must be a folder, got {str(place)!r} ({error.strerror or error})") from error
+    io.make_folder(name, place)
     return place

@@ -9,17 +9,16 @@ import os
 import platform
 import sys
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import cv2
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from stereokit.kernels.pool import available_threads
 from stereokit.kernels.simd import vector_bits
+from stereokit_evaluation import _versions
 from stereokit_evaluation._peers import HH, PEERS, THREE_WAY, label, usable_levels
 from stereokit_evaluation._rounds import Spread, ratio, spread
 
@@ -292,17 +291,7 @@ def _share(findings: Findings, size: str, key: str) -> float | None:
 
 def versions() -> dict[str, str | None]:
     """Return the versions of this package and of those that times depend on."""
-    found: dict[str, str | None] = {name: _version(name) for name in ("stereokit", "numba", "numpy")}
-    found |= {"opencv": cv2.__version__, "python": platform.python_version()}
-    others = {peer.module for peer in PEERS.values()} - {"cv2"}
-    return found | {name: _version(name) for name in sorted(others) if _version(name)}
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    return _versions.versions({peer.module for peer in PEERS.values()} - {"cv2"})
 
 
 def load() -> list[float] | None:

@@ -36,9 +36,10 @@ from stereokit.commandline import (
 )
 from stereokit.errors import FileError, OptionError, StereokitError
 from stereokit.inputs import check_integer
-from stereokit.io import DISPARITY_SUFFIXES, write_bytes
+from stereokit.io import DISPARITY_SUFFIXES
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation.batch_run import Engine, Summary, identity, on_threads, run_batch
+from stereokit_evaluation.batch_store import write_document
 from stereokit_evaluation.batch_work import Job, matcher_of
 from stereokit_evaluation.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
 from stereokit_evaluation.video_pairs import Video
@@ -108,7 +109,7 @@ def batch(
         summary.notes.append(f"the video says {source.expected} frames, {summary.pairs} could be read")
     document = {**summary.as_json(), "output": where, **engine_options, "options": identity(job, origin)}
     if Path(where).is_dir():
-        write_bytes(Path(where) / "summary.json", _text(document))
+        write_document(Path(where) / "summary.json", document)
     printed = write_json(json_file, document)
     _finish(summary, job, printed)
 
@@ -194,12 +195,6 @@ def _run(
         if summary.interrupted:
             console.print("interrupted: the same command goes on from here", highlight=False)
     return summary
-
-
-def _text(document: dict[str, Any]) -> bytes:
-    import json
-
-    return (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode()
 
 
 def _finish(summary: Summary, job: Job, printed: bool) -> None:

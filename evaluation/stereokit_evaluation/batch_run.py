@@ -6,21 +6,19 @@ and allocate once each. An engine is asked for one outcome at a time and holds a
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 import stereokit
 from stereokit.errors import StereokitError
 from stereokit.kernels.pool import available_threads
+from stereokit_evaluation._versions import versions
 from stereokit_evaluation.batch_store import finished, held
 from stereokit_evaluation.batch_work import Job, Outcome, matcher_of, work
 from stereokit_evaluation.pairs import Pair
@@ -84,13 +82,7 @@ class Summary:
             "interrupted": self.interrupted,
             "stopped": self.stopped or None,
             "notes": self.notes,
-            "versions": {
-                "stereokit": stereokit.__version__,
-                "python": platform.python_version(),
-                "numpy": np.__version__,
-                "numba": metadata.version("numba"),
-                "opencv": cv2.__version__,
-            },
+            "versions": versions(),
         }
 
 

@@ -22,7 +22,7 @@ from stereokit.errors import FileError, OptionError
 from stereokit.io import write_bytes
 from stereokit_evaluation._folders import check_folder, make_folder
 
-__all__ = ["COLOR", "finished", "held", "publish", "target_of"]
+__all__ = ["COLOR", "finished", "held", "publish", "target_of", "write_document"]
 
 COLOR = "color"
 """Folder of the coloured pictures."""
@@ -71,11 +71,16 @@ def held(
             names = set()
         else:
             _check_same(folder, _read(folder / _MANIFEST), made_with, names)
-        write_bytes(folder / _MANIFEST, (json.dumps(made_with, indent=2, ensure_ascii=False) + "\n").encode())
+        write_document(folder / _MANIFEST, made_with)
         try:
             yield names
         finally:
             shutil.rmtree(folder / _PARTIAL, ignore_errors=True)
+
+
+def write_document(path: Path, content: dict[str, Any]) -> None:
+    """Write what a person may want to read: JSON with names as they are."""
+    write_bytes(path, (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode())
 
 
 def finished(folder: Path, suffix: str) -> set[str]:

@@ -6,7 +6,6 @@ Either goes to a temporary name beside the target, is renamed when it is complet
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import FileError, StereokitError
-from stereokit.io import check_output
+from stereokit.errors import StereokitError
+from stereokit.io import check_output, replacing
 
 __all__ = ["SUFFIXES", "check_large_output", "write_bands"]
 
@@ -59,15 +58,9 @@ def write_bands(path: Path, height: int, width: int, bands: Iterable[NDArray[np.
     FileError
         If the file cannot be written.
     """
-    temporary = path.parent / f".{secrets.token_hex(8)}.tmp"
     write = _write_npy if path.suffix.lower() == ".npy" else _write_tiff
-    try:
+    with replacing(path) as temporary:
         write(temporary, height, width, bands)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _write_npy(path: Path, height: int, width: int, bands: Iterable[NDArray[np.float32]]) -> None:

@@ -11,6 +11,14 @@ from stereokit.costs.rows import Levels, Pair, produce_volume
 from stereokit.costs.rows_cuda import Scene
 from stereokit.kernels.workspace import Workspace
 
+SIZES: list[tuple[tuple[int, int], Levels, float | None]] = [
+    ((1, 1), Levels(0, 1), 0.5),
+    ((3, 2), Levels(-70, 40), 1.0),
+    ((4, 65), Levels(3, 33), None),
+    ((2, 31), Levels(60, 129), 0.0),
+]
+"""Shapes, levels and costs of matches outside the right image."""
+
 
 def check_volume(
     queue: Any, cost: Any, shape: tuple[int, int], levels: Levels, outside: float | None = 0.5, masked: bool = False,

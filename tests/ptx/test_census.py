@@ -27,14 +27,6 @@ def test_windows_and_types(window, dtype):
     bodies.check_volume(EmulatedQueue(), Census(window), (9, 33), Levels(0, 8), dtype=dtype)
 
 
-@pytest.mark.parametrize(
-    ("shape", "levels", "outside"),
-    [
-        ((1, 1), Levels(0, 1), 0.5),
-        ((3, 2), Levels(-70, 40), 1.0),
-        ((4, 65), Levels(3, 33), None),
-        ((2, 31), Levels(60, 129), 0.0),
-    ],
-)
+@pytest.mark.parametrize(("shape", "levels", "outside"), bodies.SIZES)
 def test_sizes_and_levels(shape, levels, outside):
     bodies.check_volume(EmulatedQueue(), Census("5x5"), shape, levels, outside)

@@ -28,15 +28,7 @@ def test_windows(window):
     bodies.check_volume(EmulatedQueue(), Zncc(window), (6, 33), Levels(0, 8), dtype=np.uint16)
 
 
-@pytest.mark.parametrize(
-    ("shape", "levels", "outside"),
-    [
-        ((1, 1), Levels(0, 1), 0.5),
-        ((3, 2), Levels(-70, 40), 1.0),
-        ((4, 65), Levels(3, 33), None),
-        ((2, 31), Levels(60, 129), 0.0),
-    ],
-)
+@pytest.mark.parametrize(("shape", "levels", "outside"), bodies.SIZES)
 def test_sizes_and_levels(shape, levels, outside):
     bodies.check_volume(EmulatedQueue(), Zncc(5), shape, levels, outside)
 

@@ -14,6 +14,7 @@ import runpy
 import shlex
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import metadata
@@ -114,11 +115,11 @@ def test_the_python_of_a_page_runs(page, street, folder, capsys):
 
 
 @pytest.mark.parametrize("page", pages(*SHELL))
-def test_the_commands_of_a_page_run_or_parse(page, folder):
+def test_the_commands_of_a_page_run_or_parse(page, folder, run_python):
     for block in blocks(page):
         if block.language in SHELL:
             for words in commands(block.code):
-                check(words, block.reason is None)
+                check(words, run_python if block.reason is None else None)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -127,17 +128,20 @@ def test_the_commands_within_the_text_of_a_page_parse(page):
     for found in re.findall(r"`(stereokit [^`]+)`", text):
         words = found.split()
         if len(words) > 2:
-            check(words, False)
+            check(words, None)
         else:
             assert words[1] in typer.main.get_command(app).list_commands(None), found
 
 
-def check(words: list[str], may_run: bool) -> None:
-    """Run one command line, or parse it."""
+def check(words: list[str], run_python: Callable[..., str] | None) -> None:
+    """Run one command line, or parse it; one that bounds the memory of its process runs in a process of its own."""
     line = shlex.join(words)
     if words[0] == "stereokit":
         needed = [module for word in words for module in EXTRAS.get(word, ())]
-        if may_run and words[1] in RUN and all(find_spec(module) for module in needed):
+        may_run = run_python is not None and words[1] in RUN and all(find_spec(module) for module in needed)
+        if may_run and "--memory" in words:
+            run_python("-m", "stereokit.cli", *words[1:])
+        elif may_run:
             done = CliRunner().invoke(app, words[1:])
             assert done.exit_code == 0, f"{line}\n{done.output}"
         else:

@@ -41,7 +41,7 @@ from stereokit_evaluation._progress import progress
 from stereokit_evaluation.batch_run import Engine, Summary, identity, on_threads, run_batch
 from stereokit_evaluation.batch_store import write_document
 from stereokit_evaluation.batch_work import Job, matcher_of
-from stereokit_evaluation.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
+from stereokit_evaluation.pairs import IMAGE_SUFFIXES, LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
 from stereokit_evaluation.video_pairs import Video
 
 __all__ = ["batch", "find_pairs"]
@@ -134,6 +134,10 @@ def find_pairs(inputs: Sequence[Path], pattern: tuple[str, str] | None = None) -
     for path in inputs:
         if not path.exists():
             raise FileError(f"no such file or folder: {str(path)!r}")
+        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:  # which OpenCV would take for a video of one frame
+            raise OptionError(
+                f"inputs must be folders, lists or videos, got the image {str(path)!r}; for one pair: match"
+            )
     origin = [os.path.abspath(path) for path in inputs]
     if pattern is not None:
         if len(inputs) != 1 or not inputs[0].is_dir():

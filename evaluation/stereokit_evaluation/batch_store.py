@@ -62,7 +62,6 @@ def held(
     make_folder(folder)
     with _locked(folder):
         shutil.rmtree(folder / _PARTIAL, ignore_errors=True)  # of a run that was killed
-        make_folder(folder / _PARTIAL)
         made_with = json.loads(json.dumps(made_with))
         names = set(filter(owned, finished(folder, suffix)))
         if overwrite:
@@ -72,6 +71,7 @@ def held(
         else:
             _check_same(folder, _read(folder / _MANIFEST), made_with, names)
         write_document(folder / _MANIFEST, made_with)
+        make_folder(folder / _PARTIAL)
         try:
             yield names
         finally:

@@ -25,10 +25,10 @@ from pathlib import Path
 
 from stereokit.errors import FileError, OptionError
 
-__all__ = ["LIST_SUFFIXES", "Pair", "folder_pairs", "folders_pairs", "list_pairs"]
+__all__ = ["IMAGE_SUFFIXES", "LIST_SUFFIXES", "Pair", "folder_pairs", "folders_pairs", "list_pairs"]
 
 LIST_SUFFIXES = (".csv", ".tsv", ".txt")
-_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff")
 _FOLDERS = (
     ("left", "right"),
     *((f"{top}image_{a}", f"{top}image_{b}") for top in ("", "training/", "testing/") for a, b in ((2, 3), (0, 1))),
@@ -79,7 +79,9 @@ def folder_pairs(folder: Path, pattern: tuple[str, str] | None = None) -> list[P
     found: dict[str, list[tuple[str, str]]] = {"l": [], "r": []}
     for file in _files(folder):
         stem, suffix = os.path.splitext(file)
-        if suffix.lower() in _IMAGES and (match := next(filter(None, (s.fullmatch(stem) for s in _SIDES)), None)):
+        if suffix.lower() in IMAGE_SUFFIXES and (
+            match := next(filter(None, (s.fullmatch(stem) for s in _SIDES)), None)
+        ):
             found[match["side"][0].lower()].append((match["name"], file))
     sides = [_named(folder, found[side]) for side in "lr"]
     rule = "left and right, image_2 and image_3, or files NAME_left and NAME_right"
@@ -165,7 +167,7 @@ def _files(folder: Path) -> list[str]:
 
 def _stems(folder: Path) -> dict[str, str]:
     split = ((os.path.splitext(file), file) for file in _files(folder))
-    return _named(folder, ((stem, file) for (stem, suffix), file in split if suffix.lower() in _IMAGES))
+    return _named(folder, ((stem, file) for (stem, suffix), file in split if suffix.lower() in IMAGE_SUFFIXES))
 
 
 def _named(folder: Path, files: Iterable[tuple[str, str]]) -> dict[str, str]:

@@ -116,6 +116,9 @@ def test_what_is_no_input_is_refused(tmp_path):
     assert "neither folders left and right" in refused(tmp_path / "empty", *out)
     assert "no such file" in refused(tmp_path / "none", *out)
     assert "nor a video" in refused(tmp_path / "a.mp4", *out)
+    (tmp_path / "a.png").write_text("no image")
+    for images_given in ([tmp_path / "a.png"], [tmp_path / "a.png", tmp_path / "a.png"]):
+        assert "folders, lists or videos, got the image" in refused(*images_given, *out)
     assert "two folders or two videos" in refused(tmp_path / "empty", tmp_path / "a.mp4", *out)
     assert "one or two" in refused(tmp_path, tmp_path, tmp_path, *out)
     write_pairs(tmp_path / "twice", ["a"])

@@ -36,12 +36,12 @@ from stereokit.commandline import (
 )
 from stereokit.errors import FileError, OptionError, StereokitError
 from stereokit.inputs import check_integer
-from stereokit.io import DISPARITY_SUFFIXES
+from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation.batch_run import Engine, Summary, identity, on_threads, run_batch
 from stereokit_evaluation.batch_store import write_document
 from stereokit_evaluation.batch_work import Job, matcher_of
-from stereokit_evaluation.pairs import IMAGE_SUFFIXES, LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
+from stereokit_evaluation.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
 from stereokit_evaluation.video_pairs import Video
 
 __all__ = ["batch", "find_pairs"]

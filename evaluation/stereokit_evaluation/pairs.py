@@ -24,11 +24,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereokit.errors import FileError, OptionError
+from stereokit.io import IMAGE_SUFFIXES
 
-__all__ = ["IMAGE_SUFFIXES", "LIST_SUFFIXES", "Pair", "folder_pairs", "folders_pairs", "list_pairs"]
+__all__ = ["LIST_SUFFIXES", "Pair", "folder_pairs", "folders_pairs", "list_pairs"]
 
 LIST_SUFFIXES = (".csv", ".tsv", ".txt")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff")
 _FOLDERS = (
     ("left", "right"),
     *((f"{top}image_{a}", f"{top}image_{b}") for top in ("", "training/", "testing/") for a, b in ((2, 3), (0, 1))),

@@ -84,6 +84,40 @@ and Motorcycle (``python -m stereokit_evaluation.search --data DIR --output sear
 
 What the table does not take: wider rows (sigma_s) and a higher sigma_r help KITTI's roads and blur Middlebury's edges;
 uniqueness helps the domain transform a little and costs time. Five paths are for those who have no memory to spare.
+
+At half size (`HALF`), found in the same way with ``--scale 0.5``: maps are upscaled linearly, and bad-2.0 counts pixels
+of full size. A pixel is twice as wide there and was smoothed by halving, so that less smoothing and smaller windows
+win on both data sets. Options that are not listed hold as at full size, penalties too: on KITTI no other gains 0.1::
+
+    S1 census+dt: tuning 5.84, validation 4.86, all 5.53; cones 5.23, teddy 6.88, Motorcycle 5.91
+      smooth      0: 5.98 (6.00); 0.3: 5.84 (5.91); 0.4: 5.84 (6.01); 0.5: 5.86 (6.28); 0.6: 6.02 (6.71); 0.7: 6.20
+                  (7.07); 0.8: 6.30 (7.36); 1.0: 6.77 (8.20)
+      window      5x5: 5.84 (6.01); 7x7: 5.91 (6.28); 9x7: 5.95 (6.35)
+      sigma_s     6: 6.10 (5.72); 10: 5.92 (5.82); 14: 5.84 (6.01); 20: 5.85 (6.10); 26: 5.83 (6.19)
+      sigma_v     3: 5.84 (5.94); 4: 5.84 (6.01); 6: 5.91 (5.98); 8: 5.96 (5.96); 10: 6.02 (5.96)
+      median      0: 6.16 (6.08); 3: 6.01 (5.98); 5: 5.84 (6.01)
+
+    S2 census+sgm: tuning 5.13, validation 4.37, all 4.89; cones 4.86, teddy 5.38, Motorcycle 5.91
+      smooth      0: 5.10 (5.23); 0.3: 5.11 (5.36); 0.4: 5.13 (5.38); 0.5: 5.20 (5.61); 0.6: 5.40 (6.22); 0.7: 5.49
+                  (6.56); 0.8: 5.70 (7.12); 1.0: 6.04 (8.26)
+      window      5x5: 5.13 (5.38); 7x7: 5.33 (5.48); 9x7: 5.36 (5.64)
+      median      0: 5.44 (5.43); 3: 5.23 (5.30); 5: 5.13 (5.38)
+      edge_factor 0.25: 5.11 (4.86); 0.35: 5.12 (5.14); 0.5: 5.13 (5.38); 0.7: 5.21 (5.79); 1.0: 5.47 (6.54)
+
+    S3 zncc+dt: tuning 5.71, validation 5.07, all 5.51; cones 5.80, teddy 6.96, Motorcycle 6.19
+      smooth      0: 5.87 (6.34); 0.3: 5.83 (6.34); 0.4: 5.71 (6.32); 0.5: 5.89 (6.59); 0.6: 5.97 (7.00); 0.7: 6.15
+                  (7.30); 0.8: 6.39 (7.77); 1.0: 6.89 (8.93)
+      window      3: 5.71 (6.32); 5: 6.43 (8.17); 7: 7.42 (10.36); 9: 8.61 (12.05)
+      sigma_s     6: 5.93 (6.10); 10: 5.81 (6.25); 14: 5.71 (6.32); 20: 5.78 (6.44); 26: 5.78 (6.54)
+      sigma_v     3: 5.76 (6.30); 4: 5.71 (6.32); 6: 5.77 (6.41); 8: 5.89 (6.46); 10: 5.93 (6.49)
+      median      0: 5.98 (6.48); 3: 5.86 (6.38); 5: 5.71 (6.32)
+
+    S4 zncc+sgm: tuning 5.18, validation 4.60, all 4.99; cones 5.30, teddy 6.01, Motorcycle 5.74
+      smooth      0: 5.19 (5.59); 0.3: 5.20 (5.58); 0.4: 5.18 (5.68); 0.5: 5.23 (6.13); 0.6: 5.33 (6.59); 0.7: 5.56
+                  (7.03); 0.8: 5.75 (7.61); 1.0: 6.21 (8.80)
+      window      3: 5.18 (5.68); 5: 5.70 (7.98); 7: 6.63 (10.34); 9: 7.64 (12.44)
+      median      0: 5.54 (5.88); 3: 5.33 (5.74); 5: 5.18 (5.68)
+      edge_factor 0.25: 5.24 (5.32); 0.35: 5.21 (5.43); 0.5: 5.18 (5.68); 0.7: 5.21 (6.00); 1.0: 5.23 (6.33)
 """
 
 from __future__ import annotations

@@ -136,7 +136,8 @@ class Matcher:
             self.refiner, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
             self._refine = factory(**{k: options[k] for k in refiner_options if k in options})
         self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
-        self._confident = self.confidence or bool(getattr(self._refine, "needs_confidence", False))  # while matching
+        self._asks = bool(getattr(self._refine, "needs_candidates", False))
+        self._confident = self.confidence or self._asks or bool(getattr(self._refine, "needs_confidence", False))
         self._pool = Pool()
         self.device = "cpu"
         self._cuda: CudaPipeline | None = None
@@ -148,7 +149,7 @@ class Matcher:
 
         settings = Settings(
             self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
-            self.uniqueness, self._confident, self.right, self.smp, self.speckle, self.fill,
+            self.uniqueness, 2 if self._asks else int(self._confident), self.right, self.smp, self.speckle, self.fill,
             self.median,
         )  # fmt: skip
         try:
@@ -347,13 +348,14 @@ class Matcher:
         disparity = workspace.array("match.disparity", shape, np.float32)
         cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
         confidence = np.empty(shape, np.float32) if self._confident else None
-        out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness)
+        candidates = np.empty((2, *shape), np.float32) if self._asks else None
+        out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness, candidates)
         self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, threads, out)
         chain = Chain(self.smp, int(self.speckle * disparity.size), self.fill, self.median, low)
         disparity, valid = post_process(disparity, cost, pair.left_bad, chain, workspace, threads)
         if confidence is not None:
             confidence[~valid] = 0
-        return Disparity(disparity, valid, confidence)
+        return Disparity(disparity, valid, confidence, candidates=candidates)
 
 
 def _mirror(pair: GrayPair) -> GrayPair:

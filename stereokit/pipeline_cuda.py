@@ -51,7 +51,7 @@ class Settings(NamedTuple):
     outside: float | None
     subpixel: bool
     uniqueness: float
-    confidence: bool
+    confidence: int  # 0 none, 1 the confidence, 2 the candidates too
     right: bool
     smp: bool
     speckle: float
@@ -76,12 +76,15 @@ class DeviceDisparity:
         From 0, no better than another disparity, to 1.
     right : (H, W) float32 on the device, or None
         The map of the right view.
+    candidates : (2, H, W) float32 on the device, or None
+        As `stereokit.Disparity` has them.
     """
 
     disparity: Any
     valid: Any
     confidence: Any = None
     right: Any = None
+    candidates: Any = None
 
 
 class _Found(NamedTuple):
@@ -89,7 +92,8 @@ class _Found(NamedTuple):
 
     disparity: Any
     valid: Any
-    confidence: Any  # or None
+    confidence: Any = None
+    candidates: Any = None
 
 
 class _Image(NamedTuple):
@@ -118,7 +122,7 @@ def _from_device(name: str, image: Any) -> _Image:
     return _Image(held.reshape(held.size), held.dtype, channels, tuple(held.shape[:2]))
 
 
-def _reshaped(held: Any, shape: Shape) -> Any:
+def _reshaped(held: Any, shape: tuple[int, ...]) -> Any:
     """Return a flat array of the device as one of this shape."""
     return held.reshape(*shape)
 
@@ -188,7 +192,10 @@ class CudaPipeline:
             found, shape = self._match(queue, images, dtype, guide, bad, (height, width), pair.ranges)
             disparity, valid = queue.fetch(found.disparity), queue.fetch(found.valid).view(np.bool_)
             confidence = None if found.confidence is None else queue.fetch(found.confidence).reshape(shape)
-        return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence)
+            candidates = None
+            if found.candidates is not None:
+                candidates = queue.fetch(found.candidates).reshape(2, *shape)
+        return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence, candidates=candidates)
 
     def device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
         """Match a pair that lies on the device, and wait for nothing.
@@ -224,7 +231,7 @@ class CudaPipeline:
                 out = queue.copy(mirrored)
                 queue.launch(flip, blocks_for(out.size, flip.block), mirrored, out, *shape)
                 other = _reshaped(out, shape)
-        return DeviceDisparity(*found, other)
+        return DeviceDisparity(*found[:3], other)
 
     def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _Found:
         """Match two images on the device, or what a camera behind a mirror sees of them; the maps are the caller's."""
@@ -235,8 +242,10 @@ class CudaPipeline:
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
         found, size = self._match(queue, images, dtype, images[:pixels], None, shape)
         if self._settings.half:
-            coarse = _Found(*(None if part is None else _reshaped(part, size) for part in found))
-            return _Found(*self._refine(*coarse, _reshaped(images[:pixels], shape), stream))
+            maps = (None if part is None else _reshaped(part, size) for part in found[:3])
+            two = None if found.candidates is None else _reshaped(found.candidates, (2, *size))
+            coarse = DeviceDisparity(*maps, None, two)
+            return _Found(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
         return _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
 
     @contextmanager
@@ -274,7 +283,7 @@ class CudaPipeline:
             raise DeviceError(
                 f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * scene.padded}"
             )
-        confidence = queue.array("match.confidence", pixels if settings.confidence else 1, np.float32)
+        confidence = queue.array("match.confidence", (0, 1, 3)[settings.confidence] * pixels or 1, np.float32)
         maps = Maps(
             queue.array("match.disparity", pixels, np.float32),
             queue.array("match.cost", pixels, np.uint16 if not _floats(settings.aggregation) else np.float32),
@@ -283,18 +292,21 @@ class CudaPipeline:
             settings.levels.minimum,
             int(settings.subpixel),
             np.float32(settings.uniqueness / 100),
-            int(settings.confidence),
+            settings.confidence,
         )
         _aggregate(queue, settings, scene, guide, maps)
+        candidates = None
+        if settings.confidence > 1:
+            confidence, candidates = confidence[:pixels], confidence[pixels:]
         chain = Chain(
             settings.smp, int(settings.speckle * pixels), settings.fill, settings.median, settings.levels.minimum
         )
         left_bad = None if bad is None else bad[:pixels]
         disparity, valid = post_process(queue, maps.disparity, maps.cost, left_bad, chain, shape)
         if not settings.confidence:
-            return _Found(disparity, valid, None), shape
+            return _Found(disparity, valid), shape
         queue.launch(doubt, blocks_for(pixels, doubt.block), confidence, valid, pixels)
-        return _Found(disparity, valid, confidence), shape
+        return _Found(disparity, valid, confidence, candidates), shape
 
 
 def _floats(aggregation: Any) -> bool:

@@ -36,6 +36,9 @@ class Disparity:
         From 0, no better than another disparity, to 1.
     right : (H, W) float32, optional
         The map of the right view, pixels, NaN where invalid.
+    candidates : (2, H, W) float32, optional
+        Disparities that the aggregated costs alone are in favour of, pixels: the best, before any check, filter or
+        fill, and the best of those that are not next to it. Refiners that ask for them get them.
 
     Raises
     ------
@@ -47,6 +50,7 @@ class Disparity:
     valid: NDArray[np.bool_]
     confidence: NDArray[np.float32] | None = None
     right: NDArray[np.float32] | None = None
+    candidates: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         _check("disparity", self.disparity, np.float32, None)
@@ -56,6 +60,8 @@ class Disparity:
             _check("confidence", self.confidence, np.float32, shape)
         if self.right is not None:
             _check("right", self.right, np.float32, shape)
+        if self.candidates is not None:
+            _check("candidates", self.candidates, np.float32, (2, *shape))
 
     @property
     def density(self) -> float:

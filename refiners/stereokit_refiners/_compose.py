@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.pool import run, spans
-from stereokit_refiners.pyramid import OFFSETS
+from stereokit_refiners.pyramid import CANDIDATES, OFFSETS
 
 __all__ = ["compose"]
 
@@ -25,7 +25,7 @@ _DX = np.array([dx for _, dx in OFFSETS], np.int64)
 
 def compose(
     name: str, form: str, head: NDArray[np.float32], coarse: NDArray[np.float32], rows: int, columns: int,
-    threads: int = 1,
+    threads: int = 1, candidates: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Return the map of a head.
 
@@ -40,6 +40,8 @@ def compose(
     rows, columns : int
         Size of the map, at most ``2h`` x ``2w``.
     threads : int
+    candidates : (2, h, w) float32 or None
+        The matcher's candidates, full-size pixels, for the mixture.
 
     Returns
     -------
@@ -51,10 +53,14 @@ def compose(
     if form == "literal":
         tasks = [partial(_literal, head, y0, y1, out) for y0, y1 in parts]
     elif name == "stereokit":
+        assert candidates is not None
         corrected = np.empty(coarse.shape, np.float32)
         run([partial(_correct, head, coarse, y0, y1, corrected) for y0, y1 in spans(len(coarse), threads)], threads)
-        held = [np.empty(4 * len(OFFSETS) + 4, np.float32) for _ in parts]
-        tasks = [partial(_mix, head, corrected, _DY, _DX, y0, y1, held[k], out) for k, (y0, y1) in enumerate(parts)]
+        held = [np.empty(4 * CANDIDATES + 4, np.float32) for _ in parts]
+        given = np.ascontiguousarray(candidates)
+        tasks = [
+            partial(_mix, head, corrected, given, _DY, _DX, y0, y1, held[k], out) for k, (y0, y1) in enumerate(parts)
+        ]
     else:
         tasks = [partial(_correct_upscaled, head, coarse, y0, y1, out) for y0, y1 in parts]
     run(tasks, threads)
@@ -126,12 +132,14 @@ def _exponential(x: Any) -> Any:
 
 @kernel
 def _mix(
-    head: NDArray[np.float32], corrected: NDArray[np.float32], dy: NDArray[np.int64], dx: NDArray[np.int64],
+    head: NDArray[np.float32], corrected: NDArray[np.float32], candidates: NDArray[np.float32],
+    dy: NDArray[np.int64], dx: NDArray[np.int64],
     y0: int, y1: int, share: NDArray[np.float32], out: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Softmax-weighted mean of the candidates of each of the four phases, plus its residual."""
+    """Softmax-weighted mean of the values to choose from, for each of the four phases, plus its residual."""
     height, width = corrected.shape
-    count = dy.size
+    around = dy.size
+    count = around + len(candidates)
     bits = share.view(np.int32)
     for y in range(y0, y1):
         for x in range((out.shape[1] + 1) // 2):
@@ -158,7 +166,10 @@ def _mix(
             sum_2 = np.float32(0)
             sum_3 = np.float32(0)
             for k in range(count):
-                value = corrected[min(max(y + dy[k], 0), height - 1), min(max(x + dx[k], 0), width - 1)]
+                if k < around:
+                    value = corrected[min(max(y + dy[k], 0), height - 1), min(max(x + dx[k], 0), width - 1)]
+                else:
+                    value = candidates[k - around, y, x]
                 total_0 += share[4 * k]
                 total_1 += share[4 * k + 1]
                 total_2 += share[4 * k + 2]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from stereokit_refiners.layers import Network, Weights, sub_pixel_kernel
-from stereokit_refiners.pyramid import OFFSETS
+from stereokit_refiners.pyramid import CANDIDATES, OFFSETS
 
 __all__ = ["head_graph", "map_graph", "session"]
 
@@ -110,8 +110,9 @@ def head_graph(network: Network, weights: Weights) -> onnx.ModelProto:
 def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
     """Return the whole refiner as a graph, with what `encode` and `compose` do.
 
-    Inputs ``coarse``, (1, 1, h, w), half-size pixels, filled; ``confidence``, (1, 1, h, w), 0 to 1, for networks
-    that use it; ``left``, (1, 1, 2h, 2w), grey levels 0 to 255. Output ``disparity``, (1, 1, 2h, 2w), full-size pixels.
+    Inputs ``coarse``, (1, 1, h, w), half-size pixels, filled; ``left``, (1, 1, 2h, 2w), grey levels 0 to 255; for
+    networks that use them ``confidence``, (1, 1, h, w), 0 to 1, and ``candidates``, (1, 2, h, w), half-size pixels.
+    Output ``disparity``, (1, 1, 2h, 2w), full-size pixels.
     """
     ops = _OnnxOps(network, weights)
     literal = form == "literal"
@@ -126,19 +127,23 @@ def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
     if "confidence" in network.inputs:
         inputs["confidence"] = [1, 1, "h", "w"]
         encoded["confidence"] = ops.shift(ops.multiply("confidence", 4), -2)
+    two = ""
+    if "candidates" in network.inputs:
+        inputs["candidates"] = [1, 2, "h", "w"]
+        two = ops.multiply("candidates", 2)
+        encoded["candidates"] = ops.shift(ops.multiply(two, 1 / 16), -1.5)
     head = network.forward(ops, encoded)["map"]
     if literal:
         full = ops.multiply(ops.shuffle(head), 256)
     elif network.name == "stereokit":
-        full = _mixture(ops, head, coarse)
+        full = _mixture(ops, head, coarse, two)
     else:
         full = ops.add(ops.twice(coarse), ops.multiply(ops.shuffle(head), 4))
     return _model(ops, "disparity", inputs, full, [1, 1, "2h", "2w"])
 
 
-def _mixture(ops: _OnnxOps, head: str, coarse: str) -> str:
+def _mixture(ops: _OnnxOps, head: str, coarse: str, candidates: str) -> str:
     reach = max(max(abs(dy), abs(dx)) for dy, dx in OFFSETS)
-    count = len(OFFSETS)
     corrected = ops.add(coarse, ops.multiply(ops.slice(head, 1, 0, 1), 4))
     pads = ops.constant([0, 0, reach, reach, 0, 0, reach, reach], np.int64)
     padded = ops.node("Pad", [corrected, pads], mode="edge")
@@ -147,13 +152,14 @@ def _mixture(ops: _OnnxOps, head: str, coarse: str) -> str:
         # A slice that ends `reach - d` before the border of the padded map; its end counts from the far side.
         rows = ops.slice(padded, 2, reach + dy, dy - reach if dy < reach else 2**31)
         around.append(ops.slice(rows, 3, reach + dx, dx - reach if dx < reach else 2**31))
-    candidates = ops.node("Unsqueeze", [ops.node("Concat", around, axis=1), ops.constant([2], np.int64)])
-    logits = ops.slice(head, 1, 5, 5 + 4 * count)
+    values = ops.node("Concat", [*around, candidates], axis=1)
+    values = ops.node("Unsqueeze", [values, ops.constant([2], np.int64)])
+    logits = ops.slice(head, 1, 5, 5 + 4 * CANDIDATES)
     size = ops.node("Shape", [head])
     tail = ops.node("Slice", [size, *(ops.constant([v], np.int64) for v in (2, 4, 0))])
-    shape = ops.node("Concat", [ops.constant([1, count, 4], np.int64), tail], axis=0)
+    shape = ops.node("Concat", [ops.constant([1, CANDIDATES, 4], np.int64), tail], axis=0)
     share = ops.node("Softmax", [ops.node("Reshape", [logits, shape])], axis=1)
-    mixed = ops.node("ReduceSum", [ops.node("Mul", [share, candidates]), ops.constant([1], np.int64)], keepdims=0)
+    mixed = ops.node("ReduceSum", [ops.node("Mul", [share, values]), ops.constant([1], np.int64)], keepdims=0)
     return ops.shuffle(ops.add(mixed, ops.multiply(ops.slice(head, 1, 1, 5), 4)))
 
 

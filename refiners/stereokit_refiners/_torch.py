@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from stereokit_refiners.layers import Layer, Network, sub_pixel_taps
-from stereokit_refiners.pyramid import OFFSETS
+from stereokit_refiners.pyramid import CANDIDATES, OFFSETS
 
 __all__ = ["Module", "calibrate", "compose", "runner"]
 
@@ -48,11 +48,12 @@ class Module(nn.Module):
                 if name.startswith("block_") and name.endswith("b"):
                     self.weights[_key(name, "weight")].mul_(0.3)
             if self.network.name == "stereokit":
-                logits = self.weights[_key("head", "bias")][5:].view(len(OFFSETS), 4)
+                logits = self.weights[_key("head", "bias")][5:].view(CANDIDATES, 4)
                 for phase in range(4):
                     for k, (dy, dx) in enumerate(OFFSETS):
                         near = (dy - (phase // 2 - 0.5) * 0.5) ** 2 + (dx - (phase % 2 - 0.5) * 0.5) ** 2
                         logits[k, phase] = -1.5 * near
+                    logits[len(OFFSETS) :, phase] = -1.5
 
     def forward(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the network's heads for (B, C, h, w) inputs by name."""
@@ -132,7 +133,9 @@ def _sub_pixel(weight: Tensor) -> Tensor:
     return kernel.reshape(4 * outputs, inputs, 3, 3)
 
 
-def compose(name: str, form: str, head: Tensor, coarse: Tensor) -> Tensor:
+def compose(
+    name: str, form: str, head: Tensor, coarse: Tensor, candidates: Tensor | None = None
+) -> Tensor:  # fmt: skip
     """Return the full-size map of a network's head; the twin of `stereokit_refiners._compose.compose`.
 
     Parameters
@@ -143,6 +146,8 @@ def compose(name: str, form: str, head: Tensor, coarse: Tensor) -> Tensor:
         The network's ``map``.
     coarse : (B, 1, h, w)
         Coarse map in full-size pixels.
+    candidates : (B, 2, h, w) or None
+        The matcher's candidates in full-size pixels, for the mixture.
 
     Returns
     -------
@@ -155,14 +160,14 @@ def compose(name: str, form: str, head: Tensor, coarse: Tensor) -> Tensor:
         return F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + 4 * F.pixel_shuffle(
             head, 2
         )
+    assert candidates is not None
     rows, columns = head.shape[-2:]
-    count = len(OFFSETS)
     reach = max(max(abs(dy), abs(dx)) for dy, dx in OFFSETS)
     padded = F.pad(coarse + 4 * head[:, :1], (reach,) * 4, mode="replicate")
     around = [padded[:, :, reach + dy : reach + dy + rows, reach + dx : reach + dx + columns] for dy, dx in OFFSETS]
-    candidates = torch.stack(around, 1)
-    share = head[:, 5:].reshape(-1, count, 4, rows, columns).softmax(1)
-    return F.pixel_shuffle((share * candidates).sum(1) + 4 * head[:, 1:5], 2)
+    values = torch.stack([*around, candidates[:, :1], candidates[:, 1:]], 1)
+    share = head[:, 5:].reshape(-1, CANDIDATES, 4, rows, columns).softmax(1)
+    return F.pixel_shuffle((share * values).sum(1) + 4 * head[:, 1:5], 2)
 
 
 def runner(

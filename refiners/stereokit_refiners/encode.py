@@ -40,22 +40,25 @@ def encode(
     names: tuple[str, ...],
     form: str,
     disparity: NDArray[np.float32],
-    confidence: NDArray[np.float32] | None,
     left: NDArray[Any],
+    confidence: NDArray[np.float32] | None = None,
+    candidates: NDArray[np.float32] | None = None,
 ) -> dict[str, NDArray[np.float32]]:
     """Return a network's inputs.
 
     Parameters
     ----------
     names : tuple of str
-        Which: "disparity", "image", "confidence", "phases".
+        Which: "disparity", "image", "confidence", "candidates", "phases".
     form : {"residual", "literal"}
     disparity : (h, w) float32
         Coarse map in full-size pixels, without NaN.
-    confidence : (h, w) float32 or None
-        The matcher's confidence, 0 to 1, 0 where nothing was measured; None for networks that do not look at it.
     left : (2h, 2w) uint8 or float32
         Left image, grey levels 0 to 255.
+    confidence : (h, w) float32 or None
+        The matcher's confidence, 0 to 1, 0 where nothing was measured; None for networks that do not look at it.
+    candidates : (2, h, w) float32 or None
+        The matcher's candidates in full-size pixels; None for networks that do not look at them.
 
     Returns
     -------
@@ -67,12 +70,15 @@ def encode(
         values = image.astype(np.float32) * np.float32(1 / 255)
         return values if literal else np.asarray((values - np.float32(0.4)) * np.float32(4), np.float32)
 
+    def scaled(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        values = pixels * np.float32(1 / 256) if literal else pixels * np.float32(1 / 16) - np.float32(1.5)
+        return np.asarray(values, np.float32)
+
     makers: dict[str, Callable[[], NDArray[np.float32]]] = {
-        "disparity": lambda: (
-            disparity * np.float32(1 / 256) if literal else disparity * np.float32(1 / 16) - np.float32(1.5)
-        ),
+        "disparity": lambda: scaled(disparity),
+        "candidates": lambda: scaled(_given("candidates", candidates)),
         "image": lambda: gray(half_image(left)),
-        "confidence": lambda: _given(confidence) * np.float32(4) - np.float32(2),
+        "confidence": lambda: _given("confidence", confidence) * np.float32(4) - np.float32(2),
         "phases": lambda: np.stack([gray(left[i::2, j::2]) for i in (0, 1) for j in (0, 1)]),
     }
     return {
@@ -80,7 +86,7 @@ def encode(
     }
 
 
-def _given(confidence: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    if confidence is None:
-        raise OptionError("coarse must come with a confidence for this refiner (Matcher(confidence=True)), got none")
-    return confidence
+def _given(name: str, map: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    if map is None:
+        raise OptionError(f"coarse must come with {name} for this refiner, as stereokit.Matcher gives it, got none")
+    return map

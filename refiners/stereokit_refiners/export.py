@@ -6,6 +6,7 @@ The exported graph is the whole refiner, with scaling and upsampling inside:
   network's own (4 or 8);
 - ``left``, (1, 1, 2h, 2w) float32: grey levels 0 to 255;
 - ``confidence``, (1, 1, h, w) float32, 0 to 1, 0 where not measured, for networks that look at it;
+- ``candidates``, (1, 2, h, w) float32, the matcher's, half-size pixels, for networks that look at them;
 - result ``disparity``, (1, 1, 2h, 2w) float32, full-size pixels.
 
 ONNX leaves h and w open. OpenVINO's IR is made from the same graph (opset 18).
@@ -102,10 +103,11 @@ def largest_difference(content: WeightFile, model: bytes) -> float:
     coarse[16:32, 20:50] += 8
     confidence = np.maximum(rng.random((rows, columns), np.float32) - np.float32(0.1), np.float32(0))
     left = rng.integers(0, 256, (2 * rows, 2 * columns), dtype=np.uint8)
-    refined = _reference(content, Disparity(coarse, confidence > 0, confidence), left)
+    two = np.stack([coarse, coarse[::-1]]) + rng.random((2, rows, columns), np.float32)
+    refined = _reference(content, Disparity(coarse, confidence > 0, confidence, candidates=two), left)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    feeds = {"coarse": coarse, "confidence": confidence, "left": left.astype(np.float32)}
-    given = {i.name: feeds[i.name][None, None] for i in session.get_inputs()}
+    feeds = {"coarse": coarse, "confidence": confidence, "candidates": two, "left": left.astype(np.float32)}
+    given = {i.name: feeds[i.name].reshape(1, -1, *feeds[i.name].shape[-2:]) for i in session.get_inputs()}
     return float(np.abs(session.run(None, given)[0][0, 0] - refined).max())
 
 

@@ -7,7 +7,7 @@ full-size pixels ``2 i`` and ``2 i + 1``. Odd sizes were extended by one before 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from stereokit.result import Disparity
 from stereokit_refiners.refiner import on_tensors
+
+if TYPE_CHECKING:
+    from stereokit.pipeline_cuda import DeviceDisparity
 
 __all__ = ["Linear"]
 
@@ -41,7 +44,7 @@ class Linear:
             confidence[~valid] = 0
         return Disparity(disparity, valid, confidence)
 
-    def on_device(self, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+    def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the map at the size of `left`, on the GPU; see `stereokit_refiners.refiner.DeviceRefiner`."""
-        found: tuple[Any, Any, Any] = on_tensors().linear_on_device(disparity, valid, confidence, left, stream)
+        found: tuple[Any, Any, Any] = on_tensors().linear_on_device(coarse, left, stream)
         return found

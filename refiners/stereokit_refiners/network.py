@@ -13,7 +13,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -26,6 +26,9 @@ from stereokit_refiners._compose import compose
 from stereokit_refiners.encode import encode
 from stereokit_refiners.refiner import on_tensors
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
+
+if TYPE_CHECKING:
+    from stereokit.pipeline_cuda import DeviceDisparity
 
 __all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner"]
 
@@ -124,6 +127,11 @@ class LearnedRefiner:
         """Whether the coarse map must come with the matcher's confidence."""
         return "confidence" in network_named(self._file.network).inputs
 
+    @property
+    def needs_candidates(self) -> bool:
+        """Whether the coarse map must come with the matcher's candidates."""
+        return "candidates" in network_named(self._file.network).inputs
+
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the refined map at the size of `left`; see `stereokit_refiners.refiner.Refiner`.
 
@@ -143,9 +151,10 @@ class LearnedRefiner:
         disparity = _extended(disparity * np.float32(2), below, beside)
         confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
         image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
-        inputs = encode(tuple(network.inputs), self._file.form, disparity, confidence, image)
+        two = None if coarse.candidates is None else _extended_each(coarse.candidates * np.float32(2), below, beside)
+        inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
         head = self._compiled.run(inputs, threads)
-        full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads)
+        full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
         known = _doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
         if gaps:
             missing = _doubled(unknown.view(np.uint8), rows, columns).astype(bool)
@@ -154,11 +163,9 @@ class LearnedRefiner:
         sure = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
-    def on_device(self, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+    def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.refiner.DeviceRefiner`."""
-        found: tuple[Any, Any, Any] = on_tensors().refine_on_device(
-            self._file, disparity, valid, confidence, left, stream
-        )
+        found: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return found
 
 
@@ -187,6 +194,10 @@ def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:
     if below == 0 and beside == 0:
         return np.ascontiguousarray(image)
     return np.asarray(cv2.copyMakeBorder(image, 0, below, 0, beside, cv2.BORDER_REPLICATE))
+
+
+def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArray[np.float32]:
+    return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
 
 
 def _doubled(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:

@@ -4,7 +4,9 @@ What a half-size map gets wrong is mostly *where* a disparity ends, not its valu
 foreground over its edge. So the output is a mixture: each full-size pixel is a weighted mean, the weights from a
 softmax, of the coarse values at `OFFSETS` around it, after a small correction of those values, plus a small residual
 (as convex upsampling in Teed and Deng 2020, with a longer reach). Sharp edges stay sharp, because a weight near one
-copies a value from one side.
+copies a value from one side. To choose from are also the two `candidates` of the matcher: what it was for before its
+map was checked, filtered and filled, and what it was for next; in a fifth of the pixels that stay wrong without
+them one of them is right.
 
 The work is spent at 1/4, 1/8 and 1/16 of the full size with 3x3 kernels: a receptive field of several hundred pixels
 at the arithmetic of the paper's network. The image comes in at full size, its four phases as channels, and the map
@@ -19,15 +21,18 @@ from typing import Any, ClassVar
 
 from stereokit_refiners.layers import Layer, Ops
 
-__all__ = ["OFFSETS", "Pyramid"]
+__all__ = ["CANDIDATES", "OFFSETS", "Pyramid"]
 
 OFFSETS = (
     *((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)),
     (-3, 0), (0, -3), (0, 3), (3, 0),
 )  # fmt: skip
-"""Where the candidates of a pixel lie, rows and columns of the half-size map."""
+"""Where the coarse values lie that a pixel chooses from, rows and columns of the half-size map."""
 
-_A, _B, _C, _D, _E = 16, 40, 48, 48, 22
+CANDIDATES = len(OFFSETS) + 2
+"""How many values a pixel chooses from."""
+
+_A, _B, _C, _D, _E = 16, 40, 48, 48, 20
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class Pyramid:
 
     name: ClassVar[str] = "stereokit"
     layers: ClassVar[tuple[Layer, ...]] = (
-        Layer("stem", 6, _A, kernel=3),
+        Layer("stem", 8, _A, kernel=3),
         Layer("down_1", _A, _B, kernel=3, stride=2),
         Layer("block_1a", _B, _B, kernel=3),
         Layer("block_1b", _B, _B, kernel=3),
@@ -52,9 +57,9 @@ class Pyramid:
         Layer("merge_1", _B, _B, kernel=3),
         Layer("up_1", _B, _A, kernel=1),
         Layer("merge_0", _A, _E, kernel=3),
-        Layer("head", _E, 4 * len(OFFSETS) + 4 + 1, kernel=1),
+        Layer("head", _E, 4 * CANDIDATES + 4 + 1, kernel=1),
     )
-    inputs: ClassVar[dict[str, int]] = {"disparity": 1, "confidence": 1, "phases": 4}
+    inputs: ClassVar[dict[str, int]] = {"disparity": 1, "confidence": 1, "phases": 4, "candidates": 2}
     multiple: ClassVar[int] = 8
     forms: ClassVar[tuple[str, ...]] = ("residual",)
     latent: ClassVar[bool] = False
@@ -69,7 +74,7 @@ class Pyramid:
         def up(name: str, low: Any, skip: Any) -> Any:
             return ops.activate(f"{name}_sum", ops.add(skip, ops.twice(ops.conv(name, [low], activate=False))))
 
-        a = ops.conv("stem", [inputs["disparity"], inputs["confidence"], inputs["phases"]])
+        a = ops.conv("stem", [inputs[name] for name in self.inputs])
         b = block("block_1", ops.conv("down_1", [a]))
         c = block("block_2", ops.conv("down_2", [b]))
         d = block("block_3", ops.conv("down_3", [c]))

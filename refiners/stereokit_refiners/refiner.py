@@ -7,12 +7,15 @@ map and the full-size left image. Packages announce theirs in the entry-point gr
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from numpy.typing import NDArray
 
 from stereokit.errors import StereokitError
 from stereokit.result import Disparity
+
+if TYPE_CHECKING:
+    from stereokit.pipeline_cuda import DeviceDisparity
 
 __all__ = ["DeviceRefiner", "Refiner", "on_tensors"]
 
@@ -36,8 +39,9 @@ def on_tensors() -> Any:
 class Refiner(Protocol):
     """Brings a half-size map to full size.
 
-    One that looks at the matcher's confidence has an attribute ``needs_confidence`` that is True; others may leave it
-    out. `stereokit.Matcher` then gives it a coarse map with ``confidence``. One that can work on the GPU has a method
+    One that looks at the matcher's confidence has an attribute ``needs_confidence`` that is True, and one that looks at
+    its candidates ``needs_candidates``; others may leave them out. `stereokit.Matcher` then gives it a coarse map with
+    ``confidence``, or with both. One that can work on the GPU has a method
     ``on_device``, a `DeviceRefiner`, for `stereokit.Matcher.on_device`.
     """
 
@@ -65,18 +69,16 @@ class Refiner(Protocol):
 class DeviceRefiner(Protocol):
     """Brings a half-size map to full size on the GPU, without a copy to the host."""
 
-    def __call__(
-        self, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any
-    ) -> tuple[Any, Any, Any]:  # fmt: skip
+    def __call__(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the full-size disparity, what of it was measured, and the confidence.
 
         Must wait for nothing, and be safe to call from several threads at once.
 
         Parameters
         ----------
-        disparity, valid, confidence : (ceil(H/2), ceil(W/2)) float32, uint8, float32
-            Map of the half-size pair in half-size pixels, dense; the confidence may be None. Arrays with
-            ``__cuda_array_interface__`` that the matcher will write over after what is on the stream.
+        coarse : stereokit.pipeline_cuda.DeviceDisparity, (ceil(H/2), ceil(W/2))
+            Map of the half-size pair in half-size pixels, dense. Arrays with ``__cuda_array_interface__`` that the
+            matcher will write over after what is on the stream.
         left : (H, W) uint8
             Left grey image at full size, on the device too.
         stream : numba stream

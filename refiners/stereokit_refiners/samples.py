@@ -23,11 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stereokit
-from stereokit.defaults import HALF, defaults_of
+from stereokit.defaults import defaults_of
 from stereokit.errors import FileError
 from stereokit.io import make_folder, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
+from stereokit.result import Disparity
 from stereokit_refiners.augment import Views, mirrored, moved_objects, photographed, rescaled
 
 __all__ = ["Crop", "Pair", "Sample", "Shelf", "crop", "load_variant", "make_variant", "store_variant", "whole"]
@@ -76,6 +77,8 @@ class Sample:
         Coarse map in 1/256 half-size pixels, filled.
     confidence : (h, w) uint8
         The matcher's confidence in 1/255, 0 where nothing was measured.
+    candidates : (2, h, w) uint16
+        The matcher's candidates in 1/256 half-size pixels.
     left : (2h, 2w) uint8
     truth : (2h, 2w) uint16
         1/256 full-size pixels, 0 unknown.
@@ -87,6 +90,7 @@ class Sample:
 
     coarse: NDArray[np.uint16]
     confidence: NDArray[np.uint8]
+    candidates: NDArray[np.uint16]
     left: NDArray[np.uint8]
     truth: NDArray[np.uint16]
     seen: NDArray[np.bool_]
@@ -103,6 +107,8 @@ class Crop:
         Coarse map in full-size pixels.
     confidence : (h, w) float32
         0 to 1, 0 where nothing was measured.
+    candidates : (2, h, w) float32
+        The matcher's candidates in full-size pixels.
     left : (2h, 2w) float32
         Grey levels, 0 to 255.
     truth : (2h, 2w) float32
@@ -114,6 +120,7 @@ class Crop:
 
     disparity: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    candidates: NDArray[np.float32]
     left: NDArray[np.float32]
     truth: NDArray[np.float32]
     weight: NDArray[np.float32]
@@ -127,6 +134,7 @@ def _cut(sample: Sample, y: int, x: int, rows: int, columns: int) -> Crop:
     return Crop(
         sample.coarse[small] * (np.float32(2) * _STEP),
         sample.confidence[small] * np.float32(1 / 255),
+        sample.candidates[:, y : y + rows, x : x + columns] * (np.float32(2) * _STEP),
         sample.left[large].astype(np.float32),
         truth * _STEP,
         weight.astype(np.float32),
@@ -148,11 +156,12 @@ def crop(sample: Sample, rows: int, columns: int, rng: np.random.Generator) -> C
     left = np.clip((values - np.float32(128)) * np.float32(contrast) + np.float32(128 + level), 0, 255)
     more = ((0, rows - part.disparity.shape[0]), (0, columns - part.disparity.shape[1]))
     if more == ((0, 0), (0, 0)):
-        return Crop(part.disparity, part.confidence, left.astype(np.float32), part.truth, part.weight)
+        return Crop(part.disparity, part.confidence, part.candidates, left.astype(np.float32), part.truth, part.weight)
     twice = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
         np.pad(part.confidence, more, mode="edge"),
+        np.pad(part.candidates, ((0, 0), *more), mode="edge"),
         np.pad(left, twice, mode="edge").astype(np.float32),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -168,6 +177,7 @@ def whole(sample: Sample, multiple: int) -> Crop:
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
         np.pad(part.confidence, more, mode="edge"),
+        np.pad(part.candidates, ((0, 0), *more), mode="edge"),
         np.pad(part.left, twice, mode="edge"),
         np.pad(part.truth, twice),
         np.pad(part.weight, twice),
@@ -192,17 +202,18 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     Sample
     """
     views = Views(pair.left, pair.right, pair.noc, pair.occ)
-    options = dict(HALF.get(parse_method(method), {}))
+    options: dict[str, Any] = {}
     if number > 0:
         rng = np.random.default_rng([seed, number, int(pair.digest[:8], 16)])
         if number % 2 == 0 and np.isfinite(views.noc).any():
             views = mirrored(views)
         views = photographed(rng, rescaled(rng, moved_objects(rng, views)))
-        options |= _drawn_options(rng, method)
+        options = _drawn_options(rng, method)
     noc, occ = views.noc, views.occ
     left, right = _even(views.left), _even(views.right)
-    matcher = stereokit.Matcher(method, max_disparity=-(-max_disparity // 2), threads=1, confidence=True, **options)
-    found = matcher(half(left), half(right))
+    keeper = _Keeper()
+    stereokit.Matcher(method, max_disparity=max_disparity, scale=0.5, refiner=keeper, threads=1, **options)(left, right)
+    found = keeper.coarse
     height, width = left.shape
     truth = np.zeros((height, width), np.uint16)
     seen = np.zeros((height, width), np.bool_)
@@ -210,15 +221,24 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     seen[:rows, :columns] = np.isfinite(noc)
     known = np.where(np.isfinite(noc), noc, occ)
     truth[:rows, :columns] = np.where(np.isfinite(known), np.clip(np.rint(known / _STEP), 1, 65535), 0)
-    coarse = np.clip(np.rint(found.disparity / _STEP), 0, 65535).astype(np.uint16)
-    assert found.confidence is not None
+    assert found.confidence is not None and found.candidates is not None
+    coarse, candidates = (
+        np.clip(np.rint(disparity / _STEP), 0, 65535).astype(np.uint16)
+        for disparity in (found.disparity, found.candidates)
+    )
     confidence = np.clip(np.rint(found.confidence * 255), 0, 255).astype(np.uint8)
-    return Sample(coarse, confidence, left, truth, seen, (rows, columns))
+    return Sample(coarse, confidence, candidates, left, truth, seen, (rows, columns))
 
 
-def half(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the mean of each 2x2 pixels, as `stereokit.Matcher` shrinks a pair."""
-    return np.asarray(cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA))
+class _Keeper:
+    """A refiner that keeps the coarse map that it is given."""
+
+    needs_candidates = True
+    coarse: Disparity
+
+    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
+        self.coarse = coarse
+        return Disparity(np.zeros(left.shape, np.float32), np.zeros(left.shape, np.bool_))
 
 
 def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -277,6 +297,7 @@ def _read(path: Path) -> Sample:
             return Sample(
                 held["coarse"],
                 held["confidence"],
+                held["candidates"],
                 held["left"],
                 held["truth"],
                 held["seen"],

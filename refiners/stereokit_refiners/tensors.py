@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +19,9 @@ from torch import Tensor
 from stereokit.errors import InputError, OptionError
 from stereokit_refiners._torch import Module, compose
 from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
+
+if TYPE_CHECKING:
+    from stereokit.pipeline_cuda import DeviceDisparity
 
 __all__ = ["TensorRefiner", "linear_on_device", "refine_on_device"]
 
@@ -57,7 +60,7 @@ class TensorRefiner:
         self._module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._module.eval().requires_grad_(False)
 
-    def __call__(self, coarse: Any, confidence: Any, left: Any) -> Tensor:
+    def __call__(self, coarse: Any, confidence: Any, left: Any, candidates: Any = None) -> Tensor:
         """Return the full-size map, on the device.
 
         Parameters
@@ -68,6 +71,8 @@ class TensorRefiner:
             The matcher's, 0 where nothing was measured; None for networks that do not look at it.
         left : (H, W) uint8
             Grey image.
+        candidates : (2, ceil(H/2), ceil(W/2)) float32, or None
+            The matcher's, half-size pixels; None for networks that do not look at them.
 
         Returns
         -------
@@ -78,28 +83,34 @@ class TensorRefiner:
         InputError
             If the sizes do not fit one another.
         """
-        if confidence is None and "confidence" in self.network.inputs:
-            raise InputError(f"confidence must be given for refiner {self.network.name!r}, got None")
+        for name, given in (("confidence", confidence), ("candidates", candidates)):
+            if given is None and name in self.network.inputs:
+                raise InputError(f"{name} must be given for refiner {self.network.name!r}, got None")
         disparity, image = (torch.as_tensor(x, device=self.device) for x in (coarse, left))
         known = torch.zeros_like(disparity) if confidence is None else torch.as_tensor(confidence, device=self.device)
+        two = torch.stack([disparity] * 2) if candidates is None else torch.as_tensor(candidates, device=self.device)
         if image.ndim != 2 or disparity.shape != ((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2):
             found = f"{tuple(disparity.shape)} and {tuple(image.shape)}"
             raise InputError(f"coarse must be (H/2, W/2), rounded up, of left (H, W), got {found}")
         if known.shape != disparity.shape:
             wanted, found = tuple(disparity.shape), str(tuple(known.shape))
             raise InputError(f"confidence must have the shape of coarse {wanted}, got {found}")
+        if two.shape != (2, *disparity.shape):
+            rule = f"candidates must be two maps of the shape of coarse {tuple(disparity.shape)}"
+            raise InputError(f"{rule}, got {tuple(two.shape)}")
         rows, columns = image.shape
         height, width = disparity.shape
         below, beside = -height % self.network.multiple, -width % self.network.multiple
         with torch.inference_mode():
             disparity = _extended(disparity.float() * 2, below, beside)
             known = _extended(known.float(), below, beside)
+            two = _extended(two.float() * 2, below, beside)
             gray = _extended(image.float(), 2 * (height + below) - rows, 2 * (width + beside) - columns)
-            heads = self._module(self._encoded(disparity, known, gray))
-            full = compose(self.network.name, self.content.form, heads["map"], disparity)
+            heads = self._module(self._encoded(disparity, known, two, gray))
+            full = compose(self.network.name, self.content.form, heads["map"], disparity, two)
             return full[0, 0, :rows, :columns].contiguous()
 
-    def _encoded(self, disparity: Tensor, confidence: Tensor, left: Tensor) -> dict[str, Tensor]:
+    def _encoded(self, disparity: Tensor, confidence: Tensor, two: Tensor, left: Tensor) -> dict[str, Tensor]:
         """Return the network's inputs: `stereokit_refiners.encode.encode` in torch."""
         literal = self.content.form == "literal"
         gray = left / 255 if literal else (left / 255 - 0.4) * 4
@@ -108,24 +119,23 @@ class TensorRefiner:
             "image": F.avg_pool2d(gray, 2),
             "phases": F.pixel_unshuffle(gray, 2),
             "confidence": confidence * 4 - 2,
+            "candidates": two / 16 - 1.5,
         }
         return {name: encoded[name] for name in self.network.inputs}
 
 
 def refine_on_device(
-    content: WeightFile, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any
+    content: WeightFile, coarse: DeviceDisparity, left: Any, stream: Any
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Refine a map that lies on the GPU with a network; see `stereokit_refiners.refiner.DeviceRefiner`."""
     with _running_on(stream, left) as device:
-        refined = _held(content, str(device))(disparity, confidence, left)
+        refined = _held(content, str(device))(coarse.disparity, coarse.confidence, left, coarse.candidates)
         rows, columns = refined.shape
-        sure = None if confidence is None else _doubled(_tensor(confidence), rows, columns)
-        return refined, _doubled(_tensor(valid), rows, columns), sure
+        sure = None if coarse.confidence is None else _doubled(_tensor(coarse.confidence), rows, columns)
+        return refined, _doubled(_tensor(coarse.valid), rows, columns), sure
 
 
-def linear_on_device(
-    disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any
-) -> tuple[Tensor, Tensor, Tensor | None]:
+def linear_on_device(coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Tensor, Tensor, Tensor | None]:
     """Upscale a map that lies on the GPU; see `stereokit_refiners.linear` and `DeviceRefiner`."""
 
     def upscaled(image: Tensor) -> Tensor:
@@ -134,9 +144,9 @@ def linear_on_device(
 
     with _running_on(stream, left):
         rows, columns = _tensor(left).shape
-        known = _doubled(_tensor(valid), rows, columns)
-        sure = None if confidence is None else upscaled(_tensor(confidence)) * (known != 0)
-        return upscaled(_tensor(disparity)) * 2, known, sure
+        known = _doubled(_tensor(coarse.valid), rows, columns)
+        sure = None if coarse.confidence is None else upscaled(_tensor(coarse.confidence)) * (known != 0)
+        return upscaled(_tensor(coarse.disparity)) * 2, known, sure
 
 
 def _tensor(held: Any) -> Tensor:
@@ -171,5 +181,5 @@ def _doubled(image: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def _extended(image: Tensor, below: int, beside: int) -> Tensor:
-    """Return (rows, columns) as (1, 1, rows + below, columns + beside), its border repeated."""
-    return F.pad(image[None, None], (0, beside, 0, below), mode="replicate")
+    """Return (..., rows, columns) as (1, ..., rows + below, columns + beside), its border repeated; at least 1 map."""
+    return F.pad(image.reshape(1, -1, *image.shape[-2:]), (0, beside, 0, below), mode="replicate")

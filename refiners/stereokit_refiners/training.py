@@ -70,10 +70,14 @@ def _device() -> torch.device:
 
 
 def _batch(network: Network, form: str, crops: Sequence[Crop]) -> dict[str, Tensor]:
-    """Return crops as tensors: the network's inputs, and ``coarse``, ``truth``, ``weight``, all (B, C, ., .)."""
+    """Return crops as tensors, all (B, C, ., .).
+
+    The network's inputs, and in pixels ``coarse``, ``values`` (of the candidates) and ``truth``, and ``weight``.
+    """
     names = tuple(network.inputs)
-    encoded = [encode(names, form, c.disparity, c.confidence, c.left) for c in crops]
+    encoded = [encode(names, form, c.disparity, c.left, c.confidence, c.candidates) for c in crops]
     arrays = {name: np.stack([inputs[name] for inputs in encoded]) for name in names}
+    arrays["values"] = np.stack([c.candidates for c in crops])
     arrays["coarse"] = np.stack([c.disparity[None] for c in crops])
     arrays["truth"] = np.stack([c.truth[None] for c in crops])
     arrays["weight"] = np.stack([c.weight[None] for c in crops])
@@ -121,7 +125,7 @@ def _rate(settings: Settings, step: int) -> float:
 def _loss(
     settings: Settings, network: Network, heads: dict[str, Tensor], batch: dict[str, Tensor], step: int
 ) -> Tensor:
-    estimate = compose(network.name, settings.form, heads["map"], batch["coarse"])
+    estimate = compose(network.name, settings.form, heads["map"], batch["coarse"], batch["values"])
     kind = settings.finish if settings.finish and 3 * step >= 2 * settings.steps else settings.loss
     pixels = distance(kind, estimate - batch["truth"], batch["truth"]) * batch["weight"]
     loss = pixels.sum() / batch["weight"].sum().clamp(min=1)
@@ -145,7 +149,7 @@ def predict(module: Module, form: str, sample: Sample, *, half: bool = False) ->
     module.eval()
     with torch.inference_mode(), _precision(device, half):
         heads = module({name: batch[name] for name in module.network.inputs})
-        full = compose(module.network.name, form, heads["map"], batch["coarse"])
+        full = compose(module.network.name, form, heads["map"], batch["coarse"], batch["values"])
     module.train(training)
     rows, columns = sample.size
     return full[0, 0, :rows, :columns].float().cpu().numpy()

@@ -26,6 +26,7 @@ class Winners(NamedTuple):
     disparity: NDArray[np.float32]  # pixels
     cost: NDArray[Any]  # aggregated cost of the winner
     confidence: NDArray[np.float32]  # or empty, when nobody asked for it
+    candidates: NDArray[np.float32]  # the winners again, then the best that are not next to them; or empty
     levels: int
     minimum: int
     subpixel: bool
@@ -81,19 +82,22 @@ def select_pixel(
     out.disparity[to] = disparity
     out.cost[to] = values[at + level]
     if out.confidence.size > 0 or out.uniqueness > np.float32(0):
-        margin = _margin(keys, values, at, blocks, level, out.levels)
+        other = _rival(keys, at, blocks, level, out.levels)
+        margin = margin_of(best, np.float32(values[at + other])) if other != level else np.float32(1)
         if out.confidence.size > 0:
             out.confidence[to] = margin
+        if out.candidates.size > 0:
+            out.candidates[to] = disparity
+            out.candidates[out.candidates.size // 2 + to] = np.float32(other + out.minimum)
         if margin < out.uniqueness:
             out.disparity[to] = np.nan
 
 
 @inline
-def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], level: int, levels: int) -> Any:
-    """Return ``(c2 - c1) / c2`` with c2 the lowest cost that is not next to the winner's; 1 when there is no other."""
+def _rival(keys: NDArray[Any], at: int, blocks: tuple[int, ...], level: int, levels: int) -> Any:
+    """Return the level of the lowest cost that is not next to the winner, the lowest of equals; `level` if none is."""
     first = max(level - 1, 0)
     behind_last = min(level + 2, levels)
-    best = np.float32(values[at + level])
     held_0 = keys[at + first]
     held_1 = keys[at + level]
     held_2 = keys[at + behind_last - 1]
@@ -102,13 +106,12 @@ def _margin(keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int
     keys[at + level] = most
     keys[at + behind_last - 1] = most
     _, other = _best_level(keys, at, blocks)
-    rival = np.float32(values[at + other])
     keys[at + level] = held_1
     keys[at + first] = held_0
     keys[at + behind_last - 1] = held_2
     if other >= levels or (other >= first and other < behind_last):
-        return np.float32(1)
-    return margin_of(best, rival)
+        return level
+    return other
 
 
 @kernel
@@ -123,13 +126,15 @@ def select_row(
 def winners_like(
     disparity: NDArray[np.float32], cost: NDArray[Any], confidence: NDArray[np.float32] | None,
     levels: int, minimum_disparity: int, subpixel: bool, uniqueness: float = 0.0,
+    candidates: NDArray[np.float32] | None = None,
 ) -> Winners:  # fmt: skip
-    """Return the flat view of the maps that kernels write."""
-    flat = np.empty(0, np.float32) if confidence is None else confidence.ravel()
+    """Return the flat view of the maps that kernels write; `candidates` come with a `confidence` only."""
+    nobody = np.empty(0, np.float32)
     return Winners(
         disparity.ravel(),
         cost.ravel(),
-        flat,
+        nobody if confidence is None else confidence.ravel(),
+        nobody if candidates is None else candidates.ravel(),
         levels,
         minimum_disparity,
         subpixel,

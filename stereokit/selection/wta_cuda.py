@@ -37,14 +37,15 @@ from stereokit.selection.wta import margin_of, parabola
 __all__ = ["RULES", "Maps", "doubt", "group_of", "lowest_of_group", "select", "select_kernel", "selector"]
 
 RULES = (i32, i32, i32, f32, i32)
-"""Types of the number of levels, the lowest disparity, whether to interpolate, the least margin, and whether to write
-the confidence."""
+"""Types of the number of levels, the lowest disparity, whether to interpolate, the least margin, and how much to write
+of the confidence: 0 nothing, 1 itself, 2 the candidates too."""
 
 
 class Maps(NamedTuple):
     """What selection writes and by which rules; the last arguments of kernels that select.
 
-    The maps are flat, ``(H * W)`` on the device; `confidence` has one element where nobody asked for it.
+    The maps are flat, ``(H * W)`` on the device; `confidence` has one element where nobody asked for it, and thrice as
+    many with candidates: behind it lie the winners again, and the best that are not next to them.
     """
 
     disparity: Any  # float32, pixels, NaN where the margin is too small
@@ -111,20 +112,31 @@ def selector(padded: int, floats: bool) -> Any:
         base = u32(u32(lane) & u32(32 - lanes))
         winner = i32(cuda.ffs(u32(u32(votes >> base) & u32(group_bits)))) - 1
         margin = f32(1)
+        other = i32(0)
         if confident != 0 or uniqueness > f32(0):
             chosen = shuffle_from(level, i32(base) + winner)
             rival = kind(most)
             for k in range(held):
                 away = i32(abs(i32(first + i32(k) - chosen)))
-                if i32(first + i32(k)) < levels and away > 1:
-                    rival = min(rival, values[k])
+                if i32(first + i32(k)) < levels and away > 1 and values[k] < rival:
+                    rival = values[k]
+                    other = i32(first + i32(k))
+            mine = rival
             rival = lowest_of(rival)
             if rival < kind(most):
                 margin = margin_of(f32(lowest), f32(rival))
+            if confident > 1:
+                votes = u32(cuda.ballot_sync(FULL, mine == rival))
+                other = shuffle_from(other, i32(base) + i32(cuda.ffs(u32(u32(votes >> base) & u32(group_bits)))) - 1)
+                other = other if rival < kind(most) else chosen
         if alive and place == winner:
             result = f32(i32(level + minimum))
             if subpixel != 0 and level > 0 and level < levels - 1:
                 result = f32(result + parabola(f32(before), f32(best), f32(behind)))
+            if confident > 1:
+                pixels = u32(u32(confidence.size) // u32(3))
+                confidence[at + pixels] = result
+                confidence[at + pixels + pixels] = f32(i32(other + minimum))
             if margin < uniqueness:
                 result = f32(np.nan)
             disparity[at] = result

@@ -242,9 +242,9 @@ class CudaPipeline:
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
         found, size = self._match(queue, images, dtype, images[:pixels], None, shape)
         if self._settings.half:
-            maps = (None if part is None else _reshaped(part, size) for part in found[:3])
+            disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in found[:3])
             two = None if found.candidates is None else _reshaped(found.candidates, (2, *size))
-            coarse = DeviceDisparity(*maps, None, two)
+            coarse = DeviceDisparity(disparity, valid, sure, candidates=two)
             return _Found(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
         return _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
 

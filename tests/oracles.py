@@ -199,6 +199,18 @@ def select(volume, minimum=0, subpixel=True):
     return tuple(np.array(part).reshape(volume.shape[:2]) for part in zip(*flat, strict=True))
 
 
+def rivals(volume, minimum=0):
+    """Return for every pixel the first of its cheapest levels that are not next to the winner, or else the winner."""
+
+    def rival(costs):
+        costs = [float(c) for c in costs]
+        level = costs.index(min(costs))
+        others = [k for k in range(len(costs)) if abs(k - level) > 1]
+        return minimum + min(others, key=lambda k: (costs[k], k), default=level)
+
+    return np.array([[rival(costs) for costs in row] for row in volume])
+
+
 def single_matching_phase(disparity, cost):
     """Keep the cheapest of all pixels that match one right pixel (rounded); of equals the larger disparity."""
     height, width = disparity.shape

@@ -19,29 +19,34 @@ from stereokit.selection.wta import keys_of, select_row, winners_like
 LOWEST = -3
 
 
-def _maps(queue: Any, pixels: int, floats: bool, count: int, subpixel: bool, uniqueness: float, confident: bool) -> Any:
+def _maps(queue: Any, pixels: int, floats: bool, count: int, subpixel: bool, uniqueness: float, confident: int) -> Any:
     return wta_cuda.Maps(
         queue.array("disparity", pixels, np.float32),
         queue.array("cost", pixels, np.float32 if floats else np.uint16),
-        queue.array("confidence", pixels if confident else 1, np.float32),
+        queue.array("confidence", (0, 1, 3)[confident] * pixels or 1, np.float32),
         count,
         LOWEST,
         int(subpixel),
         np.float32(uniqueness / 100),
-        int(confident),
+        confident,
     )
 
 
-def _compare(queue: Any, maps: Any, disparity: np.ndarray, cost: np.ndarray, confidence: np.ndarray | None) -> None:
+def _compare(queue: Any, maps: Any, disparity: np.ndarray, cost: np.ndarray, sure: np.ndarray) -> None:
     np.testing.assert_array_equal(queue.fetch(maps.disparity), disparity.ravel())
     np.testing.assert_array_equal(queue.fetch(maps.cost), cost.ravel())
-    if confidence is not None:
-        np.testing.assert_array_equal(queue.fetch(maps.confidence), confidence.ravel())
+    if maps.confident:
+        np.testing.assert_array_equal(queue.fetch(maps.confidence), sure[: (0, 1, 3)[maps.confident]].ravel())
+
+
+def _winners(sure: np.ndarray, disparity: np.ndarray, cost: np.ndarray, count: int, subpixel: bool, least: float) -> Any:
+    """Return what the CPU writes to: `sure` is its confidence and the two candidates."""
+    return winners_like(disparity, cost, sure[0], count, LOWEST, subpixel, least, sure[1:])
 
 
 def check_paths(
     queue: Any, sgm: Sgm, shape: tuple[int, int], count: int, subpixel: bool = True, uniqueness: float = 0.0,
-    confident: bool = True,
+    confident: int = 1,
 ) -> None:  # fmt: skip
     """Compare the maps of random costs with a patch of equal ones, on a guide with edges."""
     rng = np.random.default_rng(0)
@@ -50,9 +55,9 @@ def check_paths(
     costs[1:4, 2:7] = 4
     guide = np.repeat(rng.integers(0, 30, shape), 3, axis=1)[:, : shape[1]].astype(np.uint8)
     levels = Levels(0, count)
-    disparity, confidence = np.empty((2, *shape), np.float32)
+    disparity, sure = np.empty(shape, np.float32), np.empty((3, *shape), np.float32)
     total = np.empty(shape, np.uint16)
-    out = winners_like(disparity, total, confidence if confident else None, count, LOWEST, subpixel, uniqueness)
+    out = _winners(sure, disparity, total, count, subpixel, uniqueness)
     sgm.sweep([VolumeRows(costs, levels.padded)] * 2, levels, cost, guide, Workspace(), 1, out)
     padded = pad_levels(count)
     volume = np.full((*shape, padded), 255, np.uint8)
@@ -60,7 +65,7 @@ def check_paths(
     maps = _maps(queue, disparity.size, False, count, subpixel, uniqueness, confident)
     words = queue.upload("costs", volume.view(np.uint32))
     sgm_cuda.aggregate(queue, sgm, cost, words, queue.upload("guide", guide), shape, padded, maps)
-    _compare(queue, maps, disparity, total, confidence if confident else None)
+    _compare(queue, maps, disparity, total, sure)
 
 
 def check_four_paths(queue):
@@ -68,12 +73,12 @@ def check_four_paths(queue):
 
 
 def check_eight_paths(queue):
-    check_paths(queue, Sgm(15, 85, paths=8), (6, 5), 40, uniqueness=4.0, confident=False)
+    check_paths(queue, Sgm(15, 85, paths=8), (6, 5), 40, uniqueness=4.0, confident=0)
 
 
 def check_selection(
     queue: Any, floats: bool = False, shape: tuple[int, int] = (3, 7), count: int = 10, subpixel: bool = True,
-    uniqueness: float = 3.0, confident: bool = True, bands: tuple[int, ...] = (0, 4, 7),
+    uniqueness: float = 3.0, confident: int = 2, bands: tuple[int, ...] = (0, 4, 7),
 ) -> None:  # fmt: skip
     """Compare selection from a random volume, in bands of columns, with ties and a pixel of zeros."""
     rng = np.random.default_rng(0)
@@ -86,9 +91,9 @@ def check_selection(
     whole = -(-padded // 64) * 64
     values = np.full((height, width, whole), 60000, dtype)
     values[:, :, :padded] = volume
-    disparity, confidence = np.empty((2, *shape), np.float32)
+    disparity, sure = np.empty(shape, np.float32), np.empty((3, *shape), np.float32)
     cost = np.empty(shape, dtype)
-    out = winners_like(disparity, cost, confidence if confident else None, count, LOWEST, subpixel, uniqueness)
+    out = _winners(sure, disparity, cost, count, subpixel, uniqueness)
     for y in range(height):
         row = values[y].ravel()
         select_row(keys_of(row), row, width, tuple(range(whole // 64)), y * width, out)
@@ -96,7 +101,7 @@ def check_selection(
     for first, end in itertools.pairwise(bands):
         part = queue.upload("totals", np.ascontiguousarray(volume[:, first:end]))
         wta_cuda.select(queue, part, floats, first, end - first, shape, padded, maps)
-    _compare(queue, maps, disparity, cost, confidence if confident else None)
+    _compare(queue, maps, disparity, cost, sure)
 
 
 def check_selection_of_floats(queue):

@@ -13,6 +13,7 @@ from ptx.emulated import EmulatedQueue
 from ptx.harness import Buffer
 from stereokit import Matcher, matching, pipeline_cuda
 from stereokit.errors import DeviceError, InputError
+from stereokit.result import Disparity
 from stereokit_refiners.linear import Linear
 
 LEVELS = {"max_disparity": 14, "threads": 1}
@@ -96,6 +97,25 @@ def test_blank_images(queues):
     matcher = Matcher("S4", device="cuda", **LEVELS)
     want = Matcher("S4", device="cpu", **LEVELS)(blank, blank)
     np.testing.assert_array_equal(matcher(blank, blank).disparity, want.disparity)
+
+
+class _Keeping:
+    """A refiner that keeps what it was given."""
+
+    needs_candidates = True
+
+    def __call__(self, coarse: Any, left: Any, *, threads: int = 1) -> Any:
+        self.coarse = coarse
+        return Disparity(np.zeros(left.shape, np.float32), np.ones(left.shape, bool))
+
+
+@pytest.mark.parametrize("method", ["S1", "S2"])
+def test_candidates(queues, method):
+    kept = {device: _Keeping() for device in ("cpu", "cuda")}
+    for device, refiner in kept.items():
+        Matcher(method, device=device, scale=0.5, refiner=refiner, **LEVELS)(*_pair(9, 31))
+    for name in ("disparity", "valid", "confidence", "candidates"):
+        np.testing.assert_array_equal(*(getattr(refiner.coarse, name) for refiner in kept.values()))
 
 
 def test_one_queue_serves_call_after_call_and_sizes(queues):

@@ -21,7 +21,7 @@ def test_levels(count, floats):
 
 
 @pytest.mark.parametrize(
-    ("subpixel", "uniqueness", "confident"), [(False, 0.0, False), (True, 0.0, True), (True, 20.0, False)]
+    ("subpixel", "uniqueness", "confident"), [(False, 0.0, 0), (True, 0.0, 1), (True, 20.0, 0), (False, 20.0, 2)]
 )
 def test_rules(subpixel, uniqueness, confident):
     bodies.check_selection(EmulatedQueue(), False, (4, 9), 12, subpixel, uniqueness, confident, (0, 1, 9))

@@ -321,6 +321,30 @@ def test_a_refiner_that_needs_a_confidence_is_given_it(random_pair, method):
     assert 0 <= given[-1].confidence.min() < given[-1].confidence.max() <= 1
 
 
+class Choosing(Keeping):
+    needs_candidates = True
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_refiner_that_needs_candidates_is_given_what_the_costs_alone_say(random_pair, method):
+    left, right = random_pair(31, 50, seed=17)
+    options = {"max_disparity": 20, "min_disparity": -4, "scale": 0.5, "uniqueness": 2}
+    refiner, plain, raw = Choosing(), Needing(), Keeping()
+    result = Matcher(method, refiner=refiner, **options)(left, right)
+    assert result.confidence is None and result.candidates is None
+    Matcher(method, refiner=plain, **options)(left, right)
+    assert plain.coarse.candidates is None
+    for name in ("disparity", "valid", "confidence"):
+        np.testing.assert_array_equal(getattr(refiner.coarse, name), getattr(plain.coarse, name))
+    unfiltered = {"smp": False, "speckle": 0, "median": 0, "fill": None, "uniqueness": 0}
+    Matcher(method, refiner=raw, **{**options, **unfiltered})(left, right)
+    best, rival = refiner.coarse.candidates
+    assert refiner.coarse.candidates.dtype == np.float32 and best.shape == (16, 25)
+    np.testing.assert_array_equal(best, raw.coarse.disparity)
+    assert (np.abs(rival - best) > 1).all()
+    assert ((rival >= -2) & (rival < 10)).all() and (rival == np.round(rival)).all()
+
+
 def test_the_right_view_is_refined_with_its_own_confidence(random_pair):
     left, right = random_pair(30, 50, seed=16)
     seen = []

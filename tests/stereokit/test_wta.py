@@ -7,6 +7,7 @@ import oracles
 import pytest
 
 from stereokit import InputError, select
+from stereokit.selection.wta import keys_of, select_row, winners_like
 
 TYPES = [np.uint16, np.int16, np.float32]
 
@@ -70,6 +71,28 @@ def test_confidence_over_the_whole_range_of_the_type(dtype):
     costs = np.full((1, 1, 6), high - 1, dtype)
     costs[0, 0, 2] = high // 4
     assert_selected(costs)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize(("count", "high"), [(1, 9), (3, 9), (4, 3), (63, 50), (64, 2), (130, 2000)])
+@pytest.mark.parametrize("uniqueness", [0, 40])
+def test_candidates_are_the_winner_and_its_best_rival(dtype, count, high, uniqueness):
+    volume = volume_of((4, 5), count, dtype, high)
+    padded = -(-count // 64) * 64
+    values = np.full((4, 5, padded), 30000, dtype)
+    values[:, :, :count] = volume
+    disparity, confidence = np.empty((2, 4, 5), np.float32)
+    cost, candidates = np.empty((4, 5), dtype), np.full((2, 4, 5), -99, np.float32)
+    out = winners_like(disparity, cost, confidence, count, -7, True, uniqueness, candidates)
+    for y in range(4):
+        row = values[y].ravel()
+        select_row(keys_of(row), row, 5, tuple(range(padded // 64)), 5 * y, out)
+    expected = oracles.select(volume, -7)
+    np.testing.assert_allclose(candidates[0], expected[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(candidates[1], oracles.rivals(volume, -7))
+    sure = expected[2] >= uniqueness / 100
+    np.testing.assert_array_equal(disparity[sure], candidates[0][sure])
+    assert np.isnan(disparity[~sure]).all()
 
 
 def test_without_subpixel_disparities_are_whole():

@@ -55,3 +55,8 @@ def check_zncc(queue):
 
 def check_zncc_with_masks(queue):
     check_volume(queue, Zncc(3, 200), (5, 23), Levels(-4, 9), outside=None, masked=True)
+
+
+def check_zncc_within_larger_ranges(queue):
+    """Compare a window of a larger image, whose ranges are narrower on one side and wider on the other."""
+    check_volume(queue, Zncc(5), (5, 23), Levels(0, 8), ranges=((5, 240), (20, 300)))

@@ -67,8 +67,25 @@ def check_four_paths(queue):
     check_paths(queue, Sgm(15, 85, paths=4), (5, 9), 8)
 
 
+def check_five_paths(queue):
+    check_paths(queue, Sgm(15, 85, paths=5), (5, 9), 12)
+
+
 def check_eight_paths(queue):
     check_paths(queue, Sgm(15, 85, paths=8), (6, 5), 40, uniqueness=4.0, confident=False)
+
+
+def check_full_groups(queue):
+    """Compare where no level pads, so that the last level of one line and the first of the next are neighbors."""
+    check_paths(queue, Sgm(15, 85, paths=8), (3, 5), 64)
+
+
+def check_edges(queue, factor=0.5):
+    check_paths(queue, Sgm(10, 60, edge=5, edge_factor=factor), (4, 12), 12, subpixel=False)
+
+
+def check_largest_path_costs(queue):
+    check_paths(queue, Sgm(231, 231, paths=8, edge_factor=1), (4, 6), 20)
 
 
 def check_selection(
@@ -97,6 +114,10 @@ def check_selection(
         part = queue.upload("totals", np.ascontiguousarray(volume[:, first:end]))
         wta_cuda.select(queue, part, floats, first, end - first, shape, padded, maps)
     _compare(queue, maps, disparity, cost, confidence if confident else None)
+
+
+def check_selection_of_many_levels(queue):
+    check_selection(queue, shape=(3, 5), count=130, bands=(0, 5))
 
 
 def check_selection_of_floats(queue):

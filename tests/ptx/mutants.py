@@ -20,7 +20,7 @@ _BARRIER, _SHUFFLE = "bad barrier", "bad shuffle"
 _ROUNDING, _OVERFLOW, _BORDER, _RULE = "rounding", "overflow", "border", "wrong rule"
 
 SIZES: dict[str, dict[str, Any]] = {
-    "dt.check_rf": {"shapes": ((9, 33, 8),)},
+    "dt.check_rf": {"shapes": ((9, 33, 8), (17, 1, 1))},
     "dt.check_sum": {"shapes": ((9, 33, 8),)},
     "dt.check_rf_of_many_levels": {"shapes": ((3, 27, 130),)},
     "dt.check_sum_in_bands": {"shapes": ((3, 27, 40),)},
@@ -80,12 +80,12 @@ MUTANTS = [
     Mutant(
         "products of pixels in 16 bits", "costs.zncc_cuda",
         "gain = i32(mine * pixels[4 * j + k])", "gain = i32(i16(mine * pixels[4 * j + k]))",
-        _OVERFLOW, "costs.check_zncc",
+        _OVERFLOW, "costs.check_zncc_of_16_bits",
     ),
     Mutant(
         "both factors are multiplied first", "costs.zncc_cuda",
         "f32(f32(f32(numerator) * scales[k]) * scale)", "f32(f32(numerator) * f32(scales[k] * scale))",
-        _ROUNDING, "costs.check_zncc",
+        _ROUNDING, "costs.check_zncc_rounding",
     ),
     Mutant(
         "pixels of a window leave the range", "costs.zncc_cuda",
@@ -179,8 +179,9 @@ MUTANTS = [
         "i32(value + i32(i32(i32(before - value) * weight) >> i32(15)))", _ROUNDING, "dt.check_rf",
     ),
     Mutant(
-        "255 and a half passes its byte", "aggregation.dt_cuda",
-        "min(i32(i32(value + half) >> shift), i32(255))", "i32(i32(value + half) >> shift)", _OVERFLOW, "dt.check_rf",
+        "costs from 128 on are negative", "aggregation.dt_cuda",
+        "i32(i32(word >> u32(24)) << fraction)", "i32(i32(i32(word) >> i32(24)) << fraction)",
+        _OVERFLOW, "dt.check_rf",
     ),
     Mutant(
         "a segment starts from its own mark", "aggregation.dt_cuda",
@@ -234,11 +235,11 @@ MUTANTS = [
     ),
     Mutant(
         "a root that another thread lowered is forgotten", "postprocess.speckle_cuda",
-        "apart = a != high", "apart = False", _RACE, "post.check_speckle_shapes",
+        "apart = a != high", "apart = False", _RACE, "post.check_speckle",
     ),
     Mutant(
         "parents are read as if nobody wrote them", "postprocess.speckle_cuda",
-        "        up = load_relaxed(parent, at)\n", "        up = parent[at]\n", _RACE, "post.check_speckle",
+        "    up = load_relaxed(parent, a)\n    while", "    up = parent[a]\n    while", _RACE, "post.check_speckle",
     ),
     Mutant(
         "pixels are counted without atomics", "postprocess.speckle_cuda",

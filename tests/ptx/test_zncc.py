@@ -18,6 +18,11 @@ def test_two_strips(seed):
     bodies.check_zncc(EmulatedQueue(seed))
 
 
+def test_large_products_and_rounding():
+    bodies.check_zncc_of_16_bits(EmulatedQueue())
+    bodies.check_zncc_rounding(EmulatedQueue())
+
+
 @pytest.mark.parametrize("seed", [None, 1, 2, 3])
 def test_masks_and_border_pixels(seed):
     bodies.check_zncc_with_masks(EmulatedQueue(seed))

@@ -27,8 +27,11 @@ from stereokit.kernels.cuda import KERNELS
 
 __all__ = ["SCHEDULES", "Mutant", "StaleMutant", "Uncompiled", "how_caught", "planted"]
 
-SCHEDULES = (None, 1)
-"""Seeds of the queues that a check gets, in this order; a mutant is caught by the first that fails."""
+SCHEDULES = (None,)
+"""Seeds of the queues that a check gets, in this order; a mutant is caught by the first that fails.
+
+Lockstep finds them all: whether two accesses race does not depend on the order in which they happen to come.
+"""
 
 
 class StaleMutant(Exception):

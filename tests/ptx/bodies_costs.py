@@ -22,10 +22,10 @@ SIZES: list[tuple[tuple[int, int], Levels, float | None]] = [
 
 def check_volume(
     queue: Any, cost: Any, shape: tuple[int, int], levels: Levels, outside: float | None = 0.5, masked: bool = False,
-    dtype: type = np.uint8, ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
+    dtype: type = np.uint8, ranges: tuple[tuple[int, int], tuple[int, int]] | None = None, seed: int = 0,
 ) -> None:  # fmt: skip
     """Compare all cells of a random pair with a flat patch in it, and the levels that pad."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     left, right = rng.integers(0, np.iinfo(dtype).max, (2, *shape), dtype, endpoint=True)
     left[1:5, 2 : shape[1] // 2] = 77
     bad = rng.random((2, *shape)) < 0.1
@@ -50,8 +50,23 @@ def check_census_of_two_words(queue):
 
 
 def check_zncc(queue):
-    check_volume(queue, Zncc(5), (4, 70), Levels(0, 9))
+    check_volume(queue, Zncc(5), (9, 70), Levels(0, 9))
+
+
+def check_zncc_of_16_bits(queue):
+    """Compare where products of pixels need more than 16 bits."""
+    check_volume(queue, Zncc(5), (6, 33), Levels(0, 8), dtype=np.uint16)
+
+
+def check_zncc_rounding(queue):
+    """Compare costs of which one changes when its factors are multiplied in another order."""
+    check_volume(queue, Zncc(5, 254), (9, 70), Levels(0, 32), seed=4)
 
 
 def check_zncc_with_masks(queue):
     check_volume(queue, Zncc(3, 200), (5, 23), Levels(-4, 9), outside=None, masked=True)
+
+
+def check_zncc_within_larger_ranges(queue):
+    """Compare a window of a larger image, whose ranges are narrower on one side and wider on the other."""
+    check_volume(queue, Zncc(5), (5, 23), Levels(0, 8), ranges=((5, 240), (20, 300)))

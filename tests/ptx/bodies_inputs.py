@@ -15,10 +15,20 @@ def _pair(shape: tuple[int, ...], dtype: type, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(low, high, (2, *shape), dtype, endpoint=True)
 
 
+def _halfway(dtype: type) -> np.ndarray:
+    """Return colors, ``(1, N, 3)``, whose weighted mean lies halfway between two grey levels."""
+    red, green = np.random.default_rng(0).integers(0, 256, (2, 70000))
+    blue = (2**14 - 9798 * red - 19235 * green) * pow(3735, -1, 2**15) % 2**15
+    fits = blue <= np.iinfo(dtype).max
+    return np.stack([red, green, blue], axis=1)[fits][:300].astype(dtype)[None]
+
+
 def check_grey(queue, dtype=np.uint8):
-    for shape in SHAPES:
-        height, width = shape
-        colour = _pair((*shape, 3), dtype)
+    """Compare random colors and, last, those that rounding decides."""
+    ties = _halfway(dtype)
+    assert ties.shape[1] > 250
+    for colour in [*(_pair((*shape, 3), dtype) for shape in SHAPES), np.stack([ties, ties[:, ::-1]])]:
+        shape = height, width = colour.shape[1:3]
         want = inputs.gray_pair(*colour)
         out = queue.array("pair", 2 * height * width, dtype)
         for place, image in enumerate(colour):

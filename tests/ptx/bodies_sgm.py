@@ -46,14 +46,20 @@ def _winners(sure: np.ndarray, disparity: np.ndarray, cost: np.ndarray, count: i
 
 def check_paths(
     queue: Any, sgm: Sgm, shape: tuple[int, int], count: int, subpixel: bool = True, uniqueness: float = 0.0,
-    confident: int = 1,
+    confident: int = 1, steep: bool = False,
 ) -> None:  # fmt: skip
-    """Compare the maps of random costs with a patch of equal ones, on a guide with edges."""
+    """Compare the maps of random costs with a patch of equal ones, on a guide with edges around the threshold.
+
+    Where `steep`, all levels but one are as dear as can be, and path costs grow along the paths to their largest.
+    """
     rng = np.random.default_rng(0)
     cost = Census("5x5")
     costs = rng.integers(0, cost.cost_max + 1, (*shape, count)).astype(np.uint8)
     costs[1:4, 2:7] = 4
-    guide = np.repeat(rng.integers(0, 30, shape), 3, axis=1)[:, : shape[1]].astype(np.uint8)
+    if steep:
+        costs[:], costs[:, :, 6] = cost.cost_max, 1
+    edge = int(sgm.edge)
+    guide = np.repeat(rng.choice([0, edge - 1, edge, 3 * edge], shape), 3, axis=1)[:, : shape[1]].astype(np.uint8)
     levels = Levels(0, count)
     disparity, sure = np.empty(shape, np.float32), np.empty((3, *shape), np.float32)
     total = np.empty(shape, np.uint16)
@@ -72,8 +78,27 @@ def check_four_paths(queue):
     check_paths(queue, Sgm(15, 85, paths=4), (5, 9), 8)
 
 
+def check_five_paths(queue):
+    check_paths(queue, Sgm(15, 85, paths=5), (5, 9), 12)
+
+
 def check_eight_paths(queue):
     check_paths(queue, Sgm(15, 85, paths=8), (6, 5), 40, uniqueness=4.0, confident=0)
+
+
+def check_full_groups(queue):
+    """Compare where no level pads, so that the last level of one line and the first of the next are neighbors."""
+    check_paths(queue, Sgm(15, 85, paths=8), (3, 5), 64)
+
+
+def check_edges(queue, factor=0.5):
+    """Compare with penalties so small that both are paid."""
+    check_paths(queue, Sgm(4, 14, edge=5, edge_factor=factor), (4, 12), 12, subpixel=False)
+
+
+def check_largest_path_costs(queue):
+    """Compare where path costs reach 255 and their total, in the middle, 8 times as much."""
+    check_paths(queue, Sgm(231, 231, paths=8, edge_factor=1), (23, 23), 20, steep=True)
 
 
 def check_selection(
@@ -102,6 +127,10 @@ def check_selection(
         part = queue.upload("totals", np.ascontiguousarray(volume[:, first:end]))
         wta_cuda.select(queue, part, floats, first, end - first, shape, padded, maps)
     _compare(queue, maps, disparity, cost, sure)
+
+
+def check_selection_of_many_levels(queue):
+    check_selection(queue, shape=(3, 5), count=250, bands=(0, 5))
 
 
 def check_selection_of_floats(queue):

@@ -13,7 +13,7 @@ from ptx.memory import Region
 from ptx.parser import parse
 from ptx.translate import Translation
 
-__all__ = ["CAPABILITY", "Buffer", "Report", "run", "translation_of"]
+__all__ = ["CAPABILITY", "Buffer", "Report", "forget", "run", "translation_of"]
 
 CAPABILITY = (8, 7)
 """For which GPU the kernels that are executed are compiled: Orin."""
@@ -84,6 +84,11 @@ def translation_of(kernel: Any) -> Translation:
         made.kernel = kernel  # keeps the key's object alive
         _TRANSLATIONS[key] = made
     return _TRANSLATIONS[key]
+
+
+def forget(kernel: Any) -> None:
+    """Drop what was translated of a kernel."""
+    _TRANSLATIONS.pop(id(kernel), None)
 
 
 def run(

@@ -11,7 +11,7 @@ from stereokit.aggregation.sgm_cuda import directions
 
 
 @pytest.mark.parametrize("seed", [None, 1, 2, 3])
-@pytest.mark.parametrize("check", [bodies.check_four_paths, bodies.check_eight_paths])
+@pytest.mark.parametrize("check", [bodies.check_four_paths, bodies.check_five_paths, bodies.check_eight_paths])
 def test_schedules(check, seed):
     check(EmulatedQueue(seed))
 
@@ -31,11 +31,11 @@ def test_sizes_and_levels(shape, count):
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.0])
 def test_penalties_follow_the_edges(factor):
-    bodies.check_paths(EmulatedQueue(), Sgm(10, 60, edge=5, edge_factor=factor), (4, 12), 12, subpixel=False)
+    bodies.check_edges(EmulatedQueue(), factor)
 
 
 def test_largest_path_costs():
-    bodies.check_paths(EmulatedQueue(), Sgm(231, 231, paths=8, edge_factor=1), (4, 6), 20)
+    bodies.check_largest_path_costs(EmulatedQueue())
 
 
 def test_the_last_direction_runs_along_a_column_and_none_comes_twice():

@@ -172,6 +172,11 @@ MUTANTS = [
         "behind = values[k + 1] if k < held - 1 else above", "behind = values[k + 1] if k < held - 1 else below",
         _SHUFFLE, "sgm.check_selection",
     ),
+    Mutant(
+        "the rival is that of the group's first lane", "selection.wta_cuda",
+        "other = shuffle_from(other, i32(base) + i32(cuda.ffs(u32(u32(votes >> base) & u32(group_bits)))) - 1)",
+        "other = shuffle_from(other, i32(base))", _SHUFFLE, "sgm.check_selection",
+    ),
     # ------------------------------------------------------------------ domain transform
     Mutant(
         "the way back rounds down", "aggregation.dt_cuda",

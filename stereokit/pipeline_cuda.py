@@ -176,7 +176,7 @@ class CudaPipeline:
                 none = np.zeros(shape, np.bool_)
                 masks = (none if mask is None else mask for mask in (pair.left_bad, pair.right_bad))
                 bad = queue.upload("bad", np.stack(list(masks)).view(np.uint8))
-            found, shape = self._match(queue, images, dtype, guide, bad, (height, width), pair.ranges)
+            found, shape = self.run(queue, images, dtype, guide, bad, (height, width), pair.ranges)
             disparity, valid = queue.fetch(found.disparity), queue.fetch(found.valid).view(np.bool_)
             confidence = None if found.confidence is None else queue.fetch(found.confidence).reshape(shape)
         return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence)
@@ -223,7 +223,7 @@ class CudaPipeline:
         images = queue.array("images", 2 * pixels, dtype)
         for place, image in enumerate(views):
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
-        return self._match(queue, images, dtype, images[:pixels], None, shape)[0]
+        return self.run(queue, images, dtype, images[:pixels], None, shape)[0]
 
     @contextmanager
     def _queue(self, stream: Any) -> Iterator[Any]:
@@ -238,7 +238,7 @@ class CudaPipeline:
         finally:
             free.append(queue)
 
-    def _match(
+    def run(
         self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
         ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
     ) -> tuple[_Found, Shape]:  # fmt: skip

@@ -242,7 +242,25 @@ class CudaPipeline:
         self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
         ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
     ) -> tuple[_Found, Shape]:  # fmt: skip
-        """Run all stages on grey images; return the maps and their size."""
+        """Run all stages on grey images that a queue holds; return the maps and their size.
+
+        Parameters
+        ----------
+        queue : Queue
+            Where to run.
+        images : (2 * H * W,) uint8 or uint16 on the device
+            Left and right image.
+        dtype : numpy dtype
+            Their type.
+        guide : (H * W,) uint8 on the device
+            What edges are taken from.
+        bad : (2 * H * W,) uint8 on the device, or None
+            Not 0 where a pixel has no evidence.
+        shape : (int, int)
+            Height and width, pixels, before halving.
+        ranges : ((int, int), (int, int)) or None
+            As of `stereokit.costs.rows.Pair`.
+        """
         settings = self._settings
         if settings.half:
             guide = halve(queue, "half.guide", guide, np.dtype(np.uint8), 1, shape, False)

@@ -132,22 +132,24 @@ def _loads(padded: int) -> tuple[int, float]:
 def _sgm_paths(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Work:
     padded = numbers[0]
     lanes, loads = _loads(padded)
-    pixels = a.height * a.width
-    lines = 2 * a.height + (a.count - 2) * a.width  # one pixel more than a line has is asked for
-    steps = a.count * pixels
-    reads = {"costs": padded * (steps + lines), "guide": lanes * (steps + lines), "table": 128 * blocks * 4 * (3 + a.count)}
-    passes = steps * lanes / (128 * blocks)
+    in_block = 128 // lanes
+    rows = 2 * in_block * -(-a.height // in_block)  # lines, and those past the last that only keep warps whole
+    columns = in_block * blocks - rows
+    steps = rows * a.width + columns * a.height
+    asked = steps + rows + columns  # one pixel more than a line has
+    reads = {"costs": padded * asked, "guide": lanes * asked, "table": 4 * 128 * blocks * (3 + a.count)}
+    writes = {"out": padded * a.count * a.height * a.width}
+    passes = steps / (rows + columns)
     sweeps = {"costs": a.count, "guide": a.count}
-    return Work(reads, {"out": padded * steps}, passes, 2 * loads + 1, ahead=True, sweeps=sweeps)
+    return Work(reads, writes, passes, 2 * loads + 1, ahead=True, sweeps=sweeps)
 
 
 def _sgm_final(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Work:
     padded, others = numbers[0], numbers[1] - 1
     lanes, loads = _loads(padded)
-    pixels = a.height * a.width
-    asked = padded * (pixels + a.width)
-    reads = {"costs": asked, "guide": lanes * (pixels + a.width), "stored": others * asked}
-    writes = {"disparity": 4 * pixels, "cost": 2 * pixels}
+    asked = blocks * (128 // lanes) * (a.height + 1)
+    reads = {"costs": padded * asked, "guide": lanes * asked, "stored": others * padded * asked}
+    writes = {"disparity": 4 * a.height * a.width, "cost": 2 * a.height * a.width}
     return Work(reads, writes, a.height, loads * (1 + others) + 4, ahead=True)
 
 
@@ -189,7 +191,7 @@ def _select(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Work:
 def _smp(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Work:
     pixels = blocks * a.width
     reads = {"disparity": 8 * pixels, "costs": 4 * pixels, "bids": 16 * pixels}
-    return Work(reads, {"bids": 16 * pixels}, a.width / 256, 8, every=True, sweeps={"bids": 2})
+    return Work(reads, {"bids": 16 * pixels}, a.width / 256, 8, every=True)
 
 
 def _speckle_runs(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Work:

@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from stereokit_evaluation.published import PAPER, TABLE_2
 
-__all__ = ["ASSUMED", "MACHINES", "PUBLISHED", "Machine", "Published", "libsgm_bytes"]
+__all__ = ["ASSUMED", "LIBSGM_SIZE", "MACHINES", "PUBLISHED", "Machine", "Published", "libsgm_bytes"]
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,9 @@ class Published:
     ms: float
     source: str
 
+
+LIBSGM_SIZE = 1024, 440, 128, 4
+"""Width, height, levels and paths of libSGM's published times."""
 
 _LIBSGM = "github.com/fixstars/libSGM, README"
 _EMBEDDED = "Hernandez-Juarez et al., Embedded real-time stereo estimation via SGM on the GPU, ICCS 2016"

@@ -7,8 +7,8 @@ to what the interpreter counts (`tests/ptx/test_model.py`). Instructions are tho
 
 The time of a launch is the longest of
 
-- **memory**: bytes moved, by the bandwidth. Of an array that a kernel reads again and again, a sweep counts once: caches
-  hold windows and lines, but no volumes;
+- **memory**: bytes moved, by the bandwidth. Of an array that a kernel reads again and again, a sweep counts once:
+  caches hold windows and lines, but no volumes;
 - **units**: the instructions of the busiest multiprocessor's warps, by the rate of the busiest execution unit;
 - **waiting**: what one warp takes alone, as often as warps take turns: each instruction waits for the one before it,
   and each pass of a loop for memory, unless the kernel asks ahead;
@@ -19,7 +19,6 @@ and a launch's own time is added. Sources and assumptions: `stereokit_evaluation
 from __future__ import annotations
 
 import inspect
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -55,7 +54,7 @@ class Held:
     @property
     def nbytes(self) -> int:
         """Size in bytes."""
-        return self.size * self.dtype.itemsize
+        return self.size * int(self.dtype.itemsize)
 
     def __getitem__(self, part: slice) -> Held:
         return Held(len(range(*part.indices(self.size))), self.dtype)
@@ -89,7 +88,7 @@ class Launch:
     @property
     def warps(self) -> int:
         """Warps of all blocks."""
-        return self.blocks * self.kernel.block // 32
+        return self.blocks * int(self.kernel.block) // 32
 
 
 def named(kernel: Any, arguments: Iterable[Any]) -> SimpleNamespace:
@@ -120,7 +119,10 @@ class _Recorder:
         given = named(what, arguments)
         work = work_of(what, blocks, given)
         moved = [
-            sum(round(min(count, work.sweeps.get(name, 1) * getattr(given, name).nbytes)) for name, count in side.items())
+            sum(
+                round(min(count, work.sweeps.get(name, 1) * getattr(given, name).nbytes))
+                for name, count in side.items()
+            )
             for side in (work.reads, work.writes)
         ]
         self.launches.append(Launch(what, blocks, work, *moved))

@@ -8,20 +8,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from stereokit.commandline import write_json
 from stereokit.matching import Matcher
-from stereokit_evaluation._gpu_code import Code, Resources, code_of
+from stereokit_evaluation._gpu_code import Code, Resources, code_of, require_tools
 from stereokit_evaluation._peers import label
+from stereokit_evaluation._progress import progress
 from stereokit_evaluation._sizes import Size
-from stereokit_evaluation._speed_report import new_table
+from stereokit_evaluation._speed_report import new_table, versions
 from stereokit_evaluation.gpu_machines import ASSUMED, LIBSGM_SIZE, MACHINES, PUBLISHED, Machine, libsgm_bytes
 from stereokit_evaluation.gpu_model import Launch, Time, executed, modelled, record
 
-__all__ = ["Match", "as_json", "assemble", "model_match", "print_models"]
+__all__ = ["Match", "as_json", "assemble", "launches_of", "model", "model_match", "print_models"]
 
 _VOLUMES = ("census_costs", "zncc_costs", "sgm_")
 """Kernels of which libSGM has the like: costs, paths and selection."""
@@ -83,6 +86,26 @@ class Match:
 
 
 Assembled = dict[tuple[str, str], tuple[Code, Resources]]
+
+
+def model(sizes: Sequence[Size], methods: Sequence[str], scale: float, json_file: Path | None) -> None:
+    """Model the matches, print them and write them.
+
+    Raises
+    ------
+    DeviceError
+        If a tool is missing or does not take a kernel.
+    """
+    require_tools()
+    jobs = [(size, method, *found) for size in sizes for method, found in launches_of(methods, size, scale).items()]
+    code: Assembled = {}
+    matches = []
+    with progress(sum(len({launch.kernel.name for launch in job[3]}) for job in jobs)) as (_, step):
+        for size, method, matcher, launches in jobs:
+            assemble(launches, code, step)
+            matches.append(model_match(method, size, scale, matcher, launches, code))
+    if not write_json(json_file, {**as_json(matches), "versions": versions()}):
+        print_models(matches)
 
 
 def launches_of(methods: Sequence[str], size: Size, scale: float) -> dict[str, tuple[Matcher, list[Launch]]]:
@@ -186,9 +209,9 @@ def _table(match: Match) -> Table:
     totals = (f"{match.ms(machine.name):.2f}  " for machine in MACHINES)
     table.add_row("all, modelled", *_figures(match, everything), *totals)
     double = (f"{sum(2 * time.ms - time.launch for time in match.times[machine.name]):.2f}  " for machine in MACHINES)
-    table.add_row("at twice the bounds, modelled", "", "", "", "", *double)
+    table.add_row("at twice the bounds", "", "", "", "", *double)
     only = (f"{sum(time.launch for time in match.times[machine.name]):.2f}  " for machine in MACHINES)
-    table.add_row("launches alone, modelled", "", "", "", "", *only)
+    table.add_row("launches alone", "", "", "", "", *only)
     return table
 
 

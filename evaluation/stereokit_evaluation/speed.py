@@ -26,8 +26,7 @@ from stereokit.errors import InputError, OptionError
 from stereokit.io import read_image
 from stereokit.kernels.device import describe
 from stereokit.methods import parse_method
-from stereokit_evaluation import _gpu_times
-from stereokit_evaluation._gpu_code import require_tools
+from stereokit_evaluation import _gpu_report, _gpu_times
 from stereokit_evaluation._peers import PEERS, Call, label, make, opencv_threads, peers
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._progress import progress
@@ -107,10 +106,10 @@ def bench(
         return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, runtimes, json_file)
     methods = list(dict.fromkeys(parse_method(name) for name in method or METHODS))
     if model:
-        return _model(chosen, methods, scale, json_file)
+        return _gpu_report.model(chosen, methods, scale, json_file)
     build = None
     if device == "cuda":
-        ours = _gpu_times.contenders(methods, scale)
+        ours, counts = _gpu_times.contenders(methods, scale), [max(counts)]  # only the peers have threads
         methods, build, memory, first = list(ours), _gpu_times.maker(ours), False, False
     contenders = [*methods, *(peers() if with_peers else ())]
 
@@ -166,23 +165,6 @@ def _check_tables(model: bool, device: str, pipeline: bool, stages: bool, scale:
         raise OptionError(f"scale must come with model or device cuda, got {scale:g} alone; see also pipeline")
     if runtimes is not None and not pipeline:
         raise OptionError(f"runtimes must come with pipeline, got {runtimes!r} alone")
-
-
-def _model(sizes: Sequence[Size], methods: Sequence[str], scale: float, json_file: Path | None) -> None:
-    """Model the matches, print them and write them."""
-    require_tools()
-    from stereokit_evaluation import _gpu_report as report
-
-    found = {size: report.launches_of(methods, size, scale) for size in sizes}
-    jobs = [(size, *job) for size, of_size in found.items() for job in of_size.items()]
-    code: report.Assembled = {}
-    matches = []
-    with progress(sum(len({launch.kernel.name for launch in launches}) for _, _, (_, launches) in jobs)) as (_, step):
-        for size, method, (matcher, launches) in jobs:
-            report.assemble(launches, code, step)
-            matches.append(report.model_match(method, size, scale, matcher, launches, code))
-    if not write_json(json_file, {**report.as_json(matches), "versions": versions()}):
-        report.print_models(matches)
 
 
 def _pipeline(

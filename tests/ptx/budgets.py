@@ -14,9 +14,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from stereokit_evaluation._gpu_code import ARCHITECTURES, code_of, tool, warps_that_fit
+from stereokit_evaluation._gpu_code import ARCHITECTURES, Code, Resources, code_of, tool, warps_that_fit
 
-__all__ = ["ARCHITECTURES", "TABLE", "has_tools", "kernels", "ptx", "resources"]
+__all__ = ["ARCHITECTURES", "TABLE", "assembled", "has_tools", "kernels", "ptx", "resources"]
 
 TABLE = Path(__file__).with_name("budgets.json")
 
@@ -40,13 +40,19 @@ def ptx(name: str) -> str:
     return str(kernels()[name].ptx((7, 2)))
 
 
+@cache
+def assembled(name: str, architecture: str) -> tuple[Code, Resources]:
+    """Return the code of a kernel and what it takes."""
+    return code_of(ptx(name), architecture)
+
+
 def resources(name: str, architecture: str) -> dict[str, int]:
     """Return what a kernel takes.
 
     Registers, bytes of stack and of spills of a thread, the share of warps that fit in percent, and the instructions of
     the hot loop.
     """
-    code, taken = code_of(ptx(name), architecture)
+    code, taken = assembled(name, architecture)
     fit, most = warps_that_fit(taken.registers, kernels()[name].block, architecture)
     first, end = code.hot()
     return {

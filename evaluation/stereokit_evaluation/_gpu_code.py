@@ -26,6 +26,7 @@ from stereokit.errors import DeviceError
 
 __all__ = [
     "ARCHITECTURES",
+    "DISASSEMBLED",
     "UNITS",
     "Code",
     "Resources",
@@ -43,7 +44,8 @@ ARCHITECTURES = ("sm_72", "sm_75", "sm_87", "sm_90")
 
 _REGISTERS = 65536  # of a multiprocessor, on all of these
 _WARPS = {"sm_72": 64, "sm_75": 32, "sm_87": 48, "sm_90": 64}
-_DISASSEMBLED = {"sm_72": "sm_75"}
+DISASSEMBLED = {"sm_72": "sm_75"}
+"""Architectures that nvdisasm does not read, and whose code stands in for theirs."""
 
 UNITS = {
     "memory": "LDG STG ATOMG ATOM RED REDG",
@@ -210,6 +212,6 @@ def code_of(ptx: str, architecture: str) -> tuple[Code, Resources]:
     """Assemble and disassemble a kernel; for sm_72 the code is that for sm_75, the registers are its own."""
     with tempfile.TemporaryDirectory() as folder:
         cubin = Path(folder) / "kernel.cubin"
-        taken = resources(ptx, _DISASSEMBLED.get(architecture, architecture), cubin)
+        taken = resources(ptx, DISASSEMBLED.get(architecture, architecture), cubin)
         code = parse_sass(_run([tool("nvdisasm"), "-c", cubin]).stdout)
-    return code, taken if architecture not in _DISASSEMBLED else resources(ptx, architecture)
+    return code, taken if architecture not in DISASSEMBLED else resources(ptx, architecture)

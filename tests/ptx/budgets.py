@@ -14,7 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from stereokit_evaluation._gpu_code import ARCHITECTURES, Code, Resources, code_of, tool, warps_that_fit
+from stereokit_evaluation._gpu_code import ARCHITECTURES, DISASSEMBLED, Code, Resources, code_of, tool, warps_that_fit
+from stereokit_evaluation._gpu_code import resources as taken_by
 
 __all__ = ["ARCHITECTURES", "TABLE", "assembled", "has_tools", "kernels", "ptx", "resources"]
 
@@ -43,6 +44,8 @@ def ptx(name: str) -> str:
 @cache
 def assembled(name: str, architecture: str) -> tuple[Code, Resources]:
     """Return the code of a kernel and what it takes."""
+    if architecture in DISASSEMBLED:
+        return assembled(name, DISASSEMBLED[architecture])[0], taken_by(ptx(name), architecture)
     return code_of(ptx(name), architecture)
 
 

@@ -89,7 +89,8 @@ def bench(
 
     Sizes are K = 1242x375 with 128 levels, M = 1342x1110 with 256 and H = 621x188 with 64. The columns "x HH" and
     "x 3WAY" say how many times faster than these modes of OpenCV a method is; below 1 it is slower. MDE/s are
-    millions of pixels times levels per second.
+    millions of pixels times levels per second. --model prints what four GPUs are modelled to take, beside published
+    times: nothing in these tables was measured here.
     """
     on_gpu = model or device == "cuda"
     chosen, counts = parse_sizes(sizes or ("K" if on_gpu else "K,M,H")), parse_threads(threads)
@@ -106,6 +107,8 @@ def bench(
         return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, runtimes, json_file)
     methods = list(dict.fromkeys(parse_method(name) for name in method or METHODS))
     if model:
+        if pictures is not None:
+            raise OptionError(f"left must not come with model, which looks at no image, got {str(left)!r}")
         return _gpu_report.model(chosen, methods, scale, json_file)
     build = None
     if device == "cuda":

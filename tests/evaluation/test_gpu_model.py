@@ -6,6 +6,8 @@ import json
 from collections import Counter
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -219,6 +221,13 @@ def test_a_tool_that_fails_is_told_in_one_line(monkeypatch, tmp_path):
     monkeypatch.setattr(_gpu_code, "tool", lambda name: tool)
     with pytest.raises(DeviceError, match=r"^ptxas must take the kernel, but it says: ptxas fatal: no such target$"):
         _gpu_code.resources("", "sm_72")
+
+
+def test_the_model_looks_at_no_images(tmp_path):
+    for name in ("l.png", "r.png"):
+        assert cv2.imwrite(str(tmp_path / name), np.zeros((40, 60), np.uint8))
+    done = bench("--model", "--left", tmp_path / "l.png", "--right", tmp_path / "r.png")
+    assert done.exit_code == 2 and "left must not come with model" in done.stderr and done.stderr.count("\n") == 1
 
 
 @pytest.mark.skipif(has_device(), reason="there is a GPU")

@@ -24,9 +24,9 @@ MATCHES = {  # method, scale, height, width, levels; two sizes of what takes the
 BYTES = {"speckle_join": 0.3, "speckle_count": 0.2, "fill_rows": 0.15, "sgm_paths": 0.03}
 """How far the formula may be off: loops of the first three depend on the images, the third looks its direction up."""
 
-TIGHT = ("sgm_", "zncc_costs", "census_", "median", "blur", "halve", "zncc_centre", "speckle_count")
+TIGHT = ("sgm_", "zncc_costs", "census_", "median", "blur", "halve", "zncc_centre")
 """Kernels whose instructions are known to 25 %; of the others no more than twice as many may be claimed: of branches
-both sides are counted, of short lines and images each first and last pass."""
+both sides are counted, of short lines and images each first and last pass. Trees of speckles are climbed once."""
 
 
 class _Queue(EmulatedQueue):
@@ -79,7 +79,8 @@ def test_instructions_are_those_of_the_warps(launches):
         of_warp = code_of(kernel).executed(work.passes, work.accesses, work.every)
         share = sum(of_warp.values()) * blocks * kernel.block / 32 / report.issued
         most = 1.25 if kernel.name.startswith(TIGHT) else 2.0
-        assert 0.85 <= share <= most, (kernel, share)
+        least = 0.75 if kernel.name.startswith("speckle") else 0.85
+        assert least <= share <= most, (kernel, share)
 
 
 def test_the_recorder_sees_the_same_launches(launches):

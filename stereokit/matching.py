@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -146,7 +147,7 @@ class Matcher:
         from stereokit.pipeline_cuda import CudaPipeline  # numba.cuda is imported late
 
         try:
-            self._cuda = CudaPipeline(self._cuda_settings())
+            self._cuda = CudaPipeline(self._cuda_settings(), getattr(self._refine, "on_device", None))
             self.device = "cuda"
         except DeviceError:
             if not fall_back:
@@ -232,11 +233,13 @@ class Matcher:
         InputError
             If the images cannot be used.
         DeviceError
-            If the matcher's device is not "cuda", `scale` is not 1, or the device is short of memory.
+            If the matcher's device is not "cuda", the refiner of half size works on the host only or `fill` is None
+            there, or the device is short of memory.
         """
         if self._cuda is None:
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
-        return self._cuda.device(left, right, stream)
+        found = self._cuda.device(left, right, stream)
+        return found if self.confidence else replace(found, confidence=None)
 
     def __call__(self, left: Any, right: Any) -> Disparity:
         """Match a rectified pair.

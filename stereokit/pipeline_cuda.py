@@ -85,7 +85,7 @@ class DeviceDisparity:
 
 
 class _Found(NamedTuple):
-    """Resident maps, flat; the next match on the queue writes over them."""
+    """Maps of a match on the device: resident and flat, the next match on the queue writes over them."""
 
     disparity: Any
     valid: Any
@@ -123,6 +123,12 @@ def _reshaped(held: Any, shape: Shape) -> Any:
     return held.reshape(*shape)
 
 
+def _flat(held: Any) -> Any:
+    """Return an array of the device as a flat one of numba."""
+    held = cuda.as_cuda_array(held)
+    return held.reshape(held.size)
+
+
 def new_queue(stream: Any) -> Any:
     """Return a queue of the GPU on a stream of numba, or on one of its own."""
     return DeviceQueue(stream)
@@ -135,6 +141,8 @@ class CudaPipeline:
     ----------
     settings : Settings
         Options.
+    refine : stereokit_refiners.refiner.DeviceRefiner or None
+        What brings maps of half size to full size on the device; None where refiners run on the host.
 
     Raises
     ------
@@ -142,7 +150,7 @@ class CudaPipeline:
         If a stage has no CUDA kernels.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, refine: Any = None) -> None:
         cost, aggregation = settings.cost, settings.aggregation
         if not isinstance(cost, (Census, Zncc)):
             raise DeviceError(f"cost must be census or zncc on device 'cuda', got {cost.name!r}")
@@ -151,6 +159,7 @@ class CudaPipeline:
         if isinstance(cost, Zncc):
             zncc_cuda.check_window(cost)
         self._settings = settings
+        self._refine = refine
         self._free: dict[Any, deque[Any]] = {}
 
     def host(self, pair: GrayPair) -> Disparity:
@@ -196,34 +205,39 @@ class CudaPipeline:
         InputError
             If the images cannot be used.
         DeviceError
-            If matching is at half size, whose refiners run on the host, or memory is short.
+            If matching is at half size with a refiner that works on the host only, or memory is short.
         """
-        if self._settings.half:
-            raise DeviceError("scale must be 1 for images on the device, got 0.5: refiners take images of the host")
+        if self._settings.half and self._refine is None:
+            raise DeviceError("refiner must be one with on_device for images on the device: linear, or a learned one")
+        if self._settings.half and self._settings.fill is None:
+            raise DeviceError("fill must not be None for images on the device at half size: refiners need dense maps")
         views = _from_device("left", left), _from_device("right", right)
         if views[0].shape != views[1].shape:
             raise InputError(f"left and right must have the same size, got {views[0].shape} and {views[1].shape}")
         shape = views[0].shape
-        with self._queue(cuda.default_stream() if stream is None else stream_of(stream)) as queue:
-            found = self._match_views(queue, views, False)
-            disparity, valid = (_reshaped(queue.copy(part), shape) for part in found[:2])
-            confidence = None if found.confidence is None else _reshaped(queue.copy(found.confidence), shape)
+        stream = cuda.default_stream() if stream is None else stream_of(stream)
+        with self._queue(stream) as queue:
+            found = self._match_views(queue, views, False, stream)
             other = None
             if self._settings.right:
-                mirrored = self._match_views(queue, views[::-1], True).disparity
+                mirrored = _flat(self._match_views(queue, views[::-1], True, stream).disparity)
                 out = queue.copy(mirrored)
                 queue.launch(flip, blocks_for(out.size, flip.block), mirrored, out, *shape)
                 other = _reshaped(out, shape)
-        return DeviceDisparity(disparity, valid, confidence, other)
+        return DeviceDisparity(*found, other)
 
-    def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool) -> _Found:
-        """Match two images on the device, or what a camera behind a mirror sees of them."""
+    def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _Found:
+        """Match two images on the device, or what a camera behind a mirror sees of them; the maps are the caller's."""
         shape, dtype = views[0].shape, views[0].dtype
         pixels = shape[0] * shape[1]
         images = queue.array("images", 2 * pixels, dtype)
         for place, image in enumerate(views):
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
-        return self.run(queue, images, dtype, images[:pixels], None, shape)[0]
+        found, size = self.run(queue, images, dtype, images[:pixels], None, shape)
+        if self._settings.half:
+            coarse = _Found(*(None if part is None else _reshaped(part, size) for part in found))
+            return _Found(*self._refine(*coarse, _reshaped(images[:pixels], shape), stream))
+        return _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
 
     @contextmanager
     def _queue(self, stream: Any) -> Iterator[Any]:

@@ -57,7 +57,7 @@ def _on_device(method: str, levels: int, scale: float) -> Call:
 def contenders(methods: Sequence[str], scale: float) -> dict[str, Callable[[int], Call]]:
     """Return what is timed by name: each takes the number of levels and returns the call.
 
-    At half size images of the device are left out, as `stereokit.Matcher.on_device` does not take them there.
+    At half size images of the device are left out: what refines them there is PyTorch's, and so would be the time.
 
     Raises
     ------

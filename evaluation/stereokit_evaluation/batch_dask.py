@@ -11,6 +11,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Generator, Iterable
+from concurrent.futures import CancelledError
 from typing import Any
 
 from stereokit.errors import OptionError, StereokitError
@@ -24,6 +25,7 @@ _CONNECT_S = 10
 _LOOK_S = 1.0
 _PATIENCE_S = 120.0
 """How long a cluster may be without a worker."""
+_LOST = "the Dask scheduler was lost; the same command goes on when it is back"
 
 
 def connect(scheduler: str) -> Any:
@@ -66,7 +68,7 @@ def on_cluster(job: Job, pairs: Iterable[Pair | FramePair], client: Any) -> Gene
         while more or waiting:
             now = time.monotonic()
             if now - looked > _LOOK_S:
-                threads = sum(client.nthreads().values())
+                threads = _threads(client)
                 slots, looked = 2 * threads, now
                 last_seen = now if threads else last_seen
                 if now - last_seen > _PATIENCE_S:
@@ -93,17 +95,29 @@ def on_cluster(job: Job, pairs: Iterable[Pair | FramePair], client: Any) -> Gene
                     done = wait(list(waiting), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 continue
+            except CancelledError:  # the client gives up all that it waited for when its connection ends
+                raise StereokitError(_LOST) from None
             for future in done:
+                if future.status in ("pending", "lost"):  # its worker died with the result: it is being made again
+                    continue
                 yield _result(future, waiting.pop(future))
     finally:
         if waiting and client.status == "running":
             client.cancel(list(waiting))
 
 
+def _threads(client: Any) -> int:
+    try:
+        return sum(client.nthreads().values())
+    except (OSError, RuntimeError):
+        raise StereokitError(_LOST) from None
+
+
 def _result(future: Any, name: str) -> Outcome:
-    if future.status == "finished":
+    try:
+        if future.status == "error":  # the task itself raises nothing: its workers died, again and again
+            return Outcome(name, reason=describe(future.exception()))
         outcome: Outcome = future.result()
         return outcome
-    if future.status == "error":  # the task itself raises nothing: its workers died, again and again
-        return Outcome(name, reason=describe(future.exception()))
-    raise StereokitError("the Dask scheduler was lost; the same command goes on when it is back")
+    except (CancelledError, OSError):
+        raise StereokitError(_LOST) from None

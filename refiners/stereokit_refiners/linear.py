@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.result import Disparity
+from stereokit_refiners.refiner import on_tensors
 
 __all__ = ["Linear"]
 
@@ -39,3 +40,8 @@ class Linear:
             confidence = upscale(coarse.confidence, cv2.INTER_LINEAR)
             confidence[~valid] = 0
         return Disparity(disparity, valid, confidence)
+
+    def on_device(self, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+        """Return the map at the size of `left`, on the GPU; see `stereokit_refiners.refiner.DeviceRefiner`."""
+        found: tuple[Any, Any, Any] = on_tensors().linear_on_device(disparity, valid, confidence, left, stream)
+        return found

@@ -24,6 +24,7 @@ from stereokit.postprocess import fill
 from stereokit.result import Disparity
 from stereokit_refiners._compose import compose
 from stereokit_refiners.encode import encode
+from stereokit_refiners.refiner import on_tensors
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
 
 __all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner"]
@@ -152,6 +153,13 @@ class LearnedRefiner:
             known &= ~missing
         sure = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
+
+    def on_device(self, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+        """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.refiner.DeviceRefiner`."""
+        found: tuple[Any, Any, Any] = on_tensors().refine_on_device(
+            self._file, disparity, valid, confidence, left, stream
+        )
+        return found
 
 
 @dataclass(frozen=True, eq=False)

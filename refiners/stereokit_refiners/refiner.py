@@ -6,20 +6,39 @@ map and the full-size left image. Packages announce theirs in the entry-point gr
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from stereokit.errors import StereokitError
 from stereokit.result import Disparity
 
-__all__ = ["Refiner"]
+__all__ = ["DeviceRefiner", "Refiner", "on_tensors"]
+
+
+def on_tensors() -> Any:
+    """Return the module `stereokit_refiners.tensors`.
+
+    Raises
+    ------
+    StereokitError
+        If torch is not installed.
+    """
+    try:
+        return import_module("stereokit_refiners.tensors")
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise StereokitError("refiners on the GPU need torch, which is not installed: pip install torch") from None
 
 
 class Refiner(Protocol):
     """Brings a half-size map to full size.
 
     One that looks at the matcher's confidence has an attribute ``needs_confidence`` that is True; others may leave it
-    out. `stereokit.Matcher` then gives it a coarse map with ``confidence``.
+    out. `stereokit.Matcher` then gives it a coarse map with ``confidence``. One that can work on the GPU has a method
+    ``on_device``, a `DeviceRefiner`, for `stereokit.Matcher.on_device`.
     """
 
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
@@ -40,4 +59,31 @@ class Refiner(Protocol):
         -------
         Disparity, (H, W)
             In full-size pixels, on arrays of its own.
+        """
+
+
+class DeviceRefiner(Protocol):
+    """Brings a half-size map to full size on the GPU, without a copy to the host."""
+
+    def __call__(
+        self, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any
+    ) -> tuple[Any, Any, Any]:  # fmt: skip
+        """Return the full-size disparity, what of it was measured, and the confidence.
+
+        Must wait for nothing, and be safe to call from several threads at once.
+
+        Parameters
+        ----------
+        disparity, valid, confidence : (ceil(H/2), ceil(W/2)) float32, uint8, float32
+            Map of the half-size pair in half-size pixels, dense; the confidence may be None. Arrays with
+            ``__cuda_array_interface__`` that the matcher will write over after what is on the stream.
+        left : (H, W) uint8
+            Left grey image at full size, on the device too.
+        stream : numba stream
+            Where to run; ``int(stream)`` is its address, 0 the default stream.
+
+        Returns
+        -------
+        disparity, valid, confidence : (H, W) float32, uint8, float32 or None
+            In full-size pixels; arrays with ``__cuda_array_interface__`` of their own, ready when the stream is.
         """

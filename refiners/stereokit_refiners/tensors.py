@@ -7,6 +7,9 @@ anything that torch can view without a copy, such as the device arrays of numba 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -17,7 +20,7 @@ from stereokit.errors import InputError, OptionError
 from stereokit_refiners._torch import Module, compose
 from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
 
-__all__ = ["TensorRefiner"]
+__all__ = ["TensorRefiner", "linear_on_device", "refine_on_device"]
 
 
 class TensorRefiner:
@@ -61,8 +64,8 @@ class TensorRefiner:
         ----------
         coarse : (ceil(H/2), ceil(W/2)) float32
             Half-size map in half-size pixels, without NaN.
-        confidence : (ceil(H/2), ceil(W/2)) float32
-            The matcher's, 0 where nothing was measured.
+        confidence : (ceil(H/2), ceil(W/2)) float32, or None
+            The matcher's, 0 where nothing was measured; None for networks that do not look at it.
         left : (H, W) uint8
             Grey image.
 
@@ -75,7 +78,10 @@ class TensorRefiner:
         InputError
             If the sizes do not fit one another.
         """
-        disparity, known, image = (torch.as_tensor(x, device=self.device) for x in (coarse, confidence, left))
+        if confidence is None and "confidence" in self.network.inputs:
+            raise InputError(f"confidence must be given for refiner {self.network.name!r}, got None")
+        disparity, image = (torch.as_tensor(x, device=self.device) for x in (coarse, left))
+        known = torch.zeros_like(disparity) if confidence is None else torch.as_tensor(confidence, device=self.device)
         if image.ndim != 2 or disparity.shape != ((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2):
             found = f"{tuple(disparity.shape)} and {tuple(image.shape)}"
             raise InputError(f"coarse must be (H/2, W/2), rounded up, of left (H, W), got {found}")
@@ -104,6 +110,64 @@ class TensorRefiner:
             "confidence": confidence * 4 - 2,
         }
         return {name: encoded[name] for name in self.network.inputs}
+
+
+def refine_on_device(
+    content: WeightFile, disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Refine a map that lies on the GPU with a network; see `stereokit_refiners.refiner.DeviceRefiner`."""
+    with _running_on(stream, left) as device:
+        refined = _held(content, str(device))(disparity, confidence, left)
+        rows, columns = refined.shape
+        sure = None if confidence is None else _doubled(_tensor(confidence), rows, columns)
+        return refined, _doubled(_tensor(valid), rows, columns), sure
+
+
+def linear_on_device(
+    disparity: Any, valid: Any, confidence: Any, left: Any, stream: Any
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Upscale a map that lies on the GPU; see `stereokit_refiners.linear` and `DeviceRefiner`."""
+
+    def upscaled(image: Tensor) -> Tensor:
+        full = F.interpolate(image[None, None], scale_factor=2, mode="bilinear", align_corners=False)
+        return full[0, 0, :rows, :columns]
+
+    with _running_on(stream, left):
+        rows, columns = _tensor(left).shape
+        known = _doubled(_tensor(valid), rows, columns)
+        sure = None if confidence is None else upscaled(_tensor(confidence)) * (known != 0)
+        return upscaled(_tensor(disparity)) * 2, known, sure
+
+
+def _tensor(held: Any) -> Tensor:
+    """Return an array as a tensor of the same memory."""
+    return torch.as_tensor(held)
+
+
+@lru_cache(maxsize=8)
+def _held(content: WeightFile, device: str) -> TensorRefiner:
+    return TensorRefiner(content, device)
+
+
+@contextmanager
+def _running_on(stream: Any, left: Any) -> Iterator[torch.device]:
+    """Run torch's work on a stream of numba; yield the device that `left` lies on."""
+    device = _tensor(left).device
+    if device.type != "cuda":
+        yield device
+        return
+    address = int(stream)
+    chosen: Any = torch.cuda.default_stream(device)
+    if address:
+        chosen = torch.cuda.ExternalStream(address, device=device)  # type: ignore[no-untyped-call]
+    with torch.cuda.stream(chosen):
+        yield device
+
+
+def _doubled(image: Tensor, rows: int, columns: int) -> Tensor:
+    """Return each pixel four times, cut to a size."""
+    large = image.repeat_interleave(2, 0).repeat_interleave(2, 1)
+    return large[:rows, :columns].contiguous()
 
 
 def _extended(image: Tensor, below: int, beside: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
 import subprocess
@@ -11,6 +12,9 @@ import pytest
 from batches import environment, images, inodes, refused, run, start, wait_for, write_pairs
 
 from stereokit.io import read_disparity
+from stereokit_evaluation.batch_dask import connect, on_cluster
+from stereokit_evaluation.batch_work import Job
+from stereokit_evaluation.pairs import folder_pairs
 
 pytest.importorskip("distributed", reason="Dask's distributed is not installed: pip install 'stereokit[dask]'")
 
@@ -20,7 +24,13 @@ COUNT = 60
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     """Return the scheduler's file and a function that starts one more worker; all end with the module."""
-    folder = tmp_path_factory.mktemp("cluster")
+    with processes(tmp_path_factory.mktemp("cluster")) as (where, _, worker):
+        yield where, worker
+
+
+@contextlib.contextmanager
+def processes(folder):
+    """Start a scheduler; yield its file, its process, and a function that starts one more worker."""
     where = folder / "scheduler.json"
     processes = []
 
@@ -36,10 +46,12 @@ def cluster(tmp_path_factory):
 
     scheduler = launch("scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard", "--no-show")
     wait_for(where.exists, scheduler)
-    yield where, worker
-    for process in reversed(processes):
-        process.kill()
-        process.wait()
+    try:
+        yield where, scheduler, worker
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a process cannot be killed the hard way")
@@ -73,6 +85,42 @@ def test_nothing_is_lost_or_doubled_when_a_worker_dies(cluster, tmp_path):
     assert (again["found"], again["written"], again["failed"]) == (COUNT - 1, 0, 1)
     assert again["errors"][0]["name"] == "040"
     assert inodes(out) == seen
+
+
+def test_results_that_die_with_their_workers_are_made_again(tmp_path):
+    job = Job(str(tmp_path / "out"), ".png", False, "S2", (("max_disparity", 16),))
+    pairs = folder_pairs(write_pairs(tmp_path, "abcdefgh", (300, 900)))
+    (tmp_path / "out").mkdir()
+    with processes(tmp_path) as (where, _, worker):
+        doomed = [worker(), worker()]
+        with connect(str(where)) as client:
+            outcomes = on_cluster(job, pairs, client)
+            done = [next(outcomes)]  # nobody asks for the others for a while
+            wait_for(lambda: all(state.status == "finished" for state in client.futures.values()))
+            for process in doomed:
+                process.kill()
+            wait_for(lambda: all(state.status == "lost" for state in client.futures.values()))
+            worker()
+            done += outcomes
+    assert sorted(outcome.name for outcome in done) == list("abcdefgh")
+    assert not any(outcome.reason for outcome in done)
+
+
+def test_a_scheduler_that_dies_ends_the_batch_with_one_line(tmp_path):
+    write_pairs(tmp_path, [f"{k:03d}" for k in range(COUNT)], (120, 400))
+    out = tmp_path / "out"
+    with processes(tmp_path) as (where, scheduler, worker):
+        worker()
+        process = start(tmp_path, "-o", out, "--engine", "dask", "--scheduler", where, folder=tmp_path)
+        wait_for(lambda: len(inodes(out)) >= 3, process)
+        scheduler.kill()
+        assert process.wait(120) == 2
+    told = [line for line in (tmp_path / "stderr").read_text().splitlines() if line.startswith("error: ")]
+    assert len(told) == 1 and "the Dask scheduler was lost" in told[0]
+    before = inodes(out)
+    assert 3 <= len(before) < COUNT
+    again = run(tmp_path, "-o", out)
+    assert (again["found"], again["written"]) == (len(before), COUNT - len(before))
 
 
 def test_frames_of_a_video_are_sent(cluster, tmp_path):

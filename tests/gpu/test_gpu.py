@@ -106,6 +106,24 @@ def test_tensors_go_in_and_out_without_a_copy():
     np.testing.assert_array_equal(disparity.cpu().numpy(), matcher(left, right).disparity)
 
 
+@pytest.mark.parametrize("refiner", ["linear", "stereovae", "stereokit"])
+def test_maps_are_refined_where_they_are(refiner):
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("PyTorch was built without CUDA")
+    pair = _pair((121, 301))
+    options = {"max_disparity": 64, "scale": 0.5, "refiner": refiner, "confidence": True}
+    exact = {} if refiner == "linear" else {"backend": "torch"}
+    want = Matcher("S4", device="cpu", **options, **exact)(*pair)
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        tensors = [torch.as_tensor(image, device="cuda") for image in pair]
+        found = Matcher("S4", device="cuda", **options).on_device(*tensors, stream=stream)
+    stream.synchronize()
+    np.testing.assert_allclose(found.disparity.cpu().numpy(), want.disparity, rtol=0, atol=0.05)
+    np.testing.assert_array_equal(found.valid.cpu().numpy() != 0, want.valid)
+
+
 def test_too_large_a_volume_names_what_is_needed_and_free():
     matcher = Matcher("S2", device="cuda", max_disparity=2048, paths=8)
     image = np.zeros((2800, 2900), np.uint8)  # seven volumes of 16.6 GB

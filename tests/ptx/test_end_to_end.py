@@ -10,8 +10,10 @@ import pytest
 pytest.importorskip("numba_cuda")
 
 from ptx.emulated import EmulatedQueue
+from ptx.harness import Buffer
 from stereokit import Matcher, matching, pipeline_cuda
 from stereokit.errors import DeviceError, InputError
+from stereokit_refiners.linear import Linear
 
 LEVELS = {"max_disparity": 14, "threads": 1}
 
@@ -111,14 +113,27 @@ def test_costs_without_a_twin_are_refused(queues):
     assert Matcher("S4", device="cpu", window=13).device == "cpu"
 
 
-def test_images_of_the_device(queues, monkeypatch):
+@pytest.fixture
+def host_as_device(queues, monkeypatch):
+    """Take images of the host for images of the device."""
+
     def from_device(name: str, image: Any) -> Any:
         channels = 1 if image.ndim == 2 else 3
         return pipeline_cuda._Image(np.ascontiguousarray(image).ravel(), image.dtype, channels, image.shape[:2])
 
+    def flat(held: Any) -> Buffer:
+        values = np.asarray(held).ravel()
+        out = Buffer(values.size, values.dtype)
+        out.values[:], out.known[:] = values, 1
+        return out
+
     monkeypatch.setattr(pipeline_cuda, "_from_device", from_device)
     monkeypatch.setattr(pipeline_cuda, "stream_of", lambda stream: stream)
     monkeypatch.setattr(pipeline_cuda, "_reshaped", lambda held, shape: held.values.reshape(shape))
+    monkeypatch.setattr(pipeline_cuda, "_flat", flat)
+
+
+def test_images_of_the_device(host_as_device):
     left, right = (np.repeat(image[:, :, None], 3, axis=2) for image in _pair(8, 26))
     options = {**LEVELS, "right": True, "confidence": True}
     found = Matcher("S2", device="cuda", **options).on_device(left, right, stream=0)
@@ -129,13 +144,40 @@ def test_images_of_the_device(queues, monkeypatch):
     np.testing.assert_array_equal(found.right, want.right)
 
 
+@pytest.mark.parametrize("refiner", ["linear", "cnn", "stereokit"])
+def test_images_of_the_device_at_half_size(host_as_device, refiner):
+    pytest.importorskip("torch")
+    pair = _pair(9, 27)
+    options = {**LEVELS, "scale": 0.5, "refiner": refiner, "right": True, "confidence": refiner != "cnn"}
+    found = Matcher("S2", device="cuda", **options).on_device(*pair, stream=0)
+    exact = {} if refiner == "linear" else {"backend": "torch"}
+    want = Matcher("S2", device="cpu", **options, **exact)(*pair)
+    for name in ("disparity", "right"):
+        np.testing.assert_allclose(getattr(found, name), getattr(want, name), rtol=0, atol=2e-3)
+    np.testing.assert_array_equal(np.asarray(found.valid) != 0, want.valid)
+    if refiner == "cnn":
+        assert found.confidence is None
+    else:
+        np.testing.assert_allclose(found.confidence, want.confidence, rtol=0, atol=1e-6)
+
+
+def test_refiners_of_the_host_are_not_for_the_device(queues, monkeypatch):
+    pair = _pair(9, 27)
+    monkeypatch.delattr(Linear, "on_device")
+    with pytest.raises(DeviceError, match="refiner must be one with on_device for images on the device"):
+        Matcher("S2", device="cuda", scale=0.5).on_device(*pair)
+
+
+def test_gaps_are_not_refined_on_the_device(queues):
+    with pytest.raises(DeviceError, match="fill must not be None for images on the device at half size"):
+        Matcher("S2", device="cuda", scale=0.5, fill=None).on_device(*_pair(9, 27))
+
+
 def test_images_of_the_device_must_be_what_kernels_take(queues):
     matcher = Matcher("S2", device="cuda", **LEVELS)
     image = np.zeros((4, 9), np.uint8)
     with pytest.raises(InputError, match="must both lie on the device or both on the host, but left does not"):
         matcher.on_device(image, image)
-    with pytest.raises(DeviceError, match=r"scale must be 1 for images on the device, got 0\.5"):
-        Matcher("S2", device="cuda", scale=0.5).on_device(image, image)
     with pytest.raises(DeviceError, match="device must be 'cuda' for images on the device, got 'cpu'"):
         Matcher("S2", device="cpu").on_device(image, image)
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from refining import NAMES, coarse_of, image_of, one_line, random_content, weight_file
 
-from stereokit.errors import FileError, InputError, OptionError
+from stereokit.errors import FileError, InputError, OptionError, StereokitError
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
+from stereokit_refiners.linear import Linear  # noqa: E402
 from stereokit_refiners.network import LearnedRefiner  # noqa: E402
 from stereokit_refiners.tensors import TensorRefiner  # noqa: E402
 
@@ -42,6 +45,25 @@ def test_tensors_give_what_arrays_give(name, form, size, device):
     assert all(torch.equal(a, b) for a, b in zip(given, kept, strict=True))
     again = refiner(coarse.disparity, coarse.confidence, left)  # arrays of the host are taken too
     assert torch.equal(again, found)
+
+
+def test_only_networks_that_look_at_the_confidence_need_it():
+    coarse, left = coarse_of((16, 24)), image_of((16, 24))
+    for name in ("cnn", "stereovae"):
+        refiner = TensorRefiner(random_content(name), "cpu")
+        given = refiner(coarse.disparity, coarse.confidence, left)
+        assert torch.equal(refiner(coarse.disparity, None, left), given)
+    with pytest.raises(InputError, match=r"^confidence must be given for refiner 'stereokit', got None$"):
+        TensorRefiner(random_content("stereokit"), "cpu")(coarse.disparity, None, left)
+
+
+def test_the_device_needs_torch(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "stereokit_refiners.tensors")
+    coarse = coarse_of((16, 24))
+    for refiner in (Linear(), LearnedRefiner.of(random_content("cnn"))):
+        with pytest.raises(StereokitError, match="refiners on the GPU need torch, which is not installed"):
+            refiner.on_device(coarse.disparity, coarse.valid, None, image_of((16, 24)), 0)
 
 
 def test_a_file_is_taken_by_its_path(tmp_path):

@@ -43,7 +43,7 @@ from stereokit.result import Disparity
 from stereokit.selection.wta import winners_like
 
 if TYPE_CHECKING:
-    from stereokit.pipeline_cuda import CudaPipeline, DeviceDisparity
+    from stereokit.pipeline_cuda import CudaPipeline, DeviceDisparity, Settings
 
 __all__ = ["METHODS", "Matcher", "match", "warmup"]
 
@@ -145,19 +145,24 @@ class Matcher:
             self._set_device(fall_back=device == "auto")
 
     def _set_device(self, fall_back: bool) -> None:
-        from stereokit.pipeline_cuda import CudaPipeline, Settings  # numba.cuda is imported late
+        from stereokit.pipeline_cuda import CudaPipeline  # numba.cuda is imported late
 
-        settings = Settings(
-            self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
-            self.uniqueness, 2 if self._asks else int(self._confident), self.right, self.smp, self.speckle, self.fill,
-            self.median,
-        )  # fmt: skip
         try:
-            self._cuda = CudaPipeline(settings, getattr(self._refine, "on_device", None))
+            self._cuda = CudaPipeline(self._cuda_settings(), getattr(self._refine, "on_device", None))
             self.device = "cuda"
         except DeviceError:
             if not fall_back:
                 raise
+
+    def _cuda_settings(self) -> Settings:
+        """Return what `stereokit.pipeline_cuda` needs to know."""
+        from stereokit.pipeline_cuda import Settings
+
+        return Settings(
+            self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
+            self.uniqueness, 2 if self._asks else int(self._confident), self.right, self.smp, self.speckle, self.fill,
+            self.median,
+        )  # fmt: skip
 
     def _levels(self) -> Levels:
         """Return the levels of the size at which is matched."""

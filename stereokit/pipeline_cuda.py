@@ -189,7 +189,7 @@ class CudaPipeline:
                 none = np.zeros(shape, np.bool_)
                 masks = (none if mask is None else mask for mask in (pair.left_bad, pair.right_bad))
                 bad = queue.upload("bad", np.stack(list(masks)).view(np.uint8))
-            found, shape = self._match(queue, images, dtype, guide, bad, (height, width), pair.ranges)
+            found, shape = self.run(queue, images, dtype, guide, bad, (height, width), pair.ranges)
             disparity, valid = queue.fetch(found.disparity), queue.fetch(found.valid).view(np.bool_)
             confidence = None if found.confidence is None else queue.fetch(found.confidence).reshape(shape)
             candidates = None
@@ -240,7 +240,7 @@ class CudaPipeline:
         images = queue.array("images", 2 * pixels, dtype)
         for place, image in enumerate(views):
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
-        found, size = self._match(queue, images, dtype, images[:pixels], None, shape)
+        found, size = self.run(queue, images, dtype, images[:pixels], None, shape)
         if self._settings.half:
             disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in found[:3])
             two = None if found.candidates is None else _reshaped(found.candidates, (2, *size))
@@ -261,11 +261,29 @@ class CudaPipeline:
         finally:
             free.append(queue)
 
-    def _match(
+    def run(
         self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
         ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
     ) -> tuple[_Found, Shape]:  # fmt: skip
-        """Run all stages on grey images; return the maps and their size."""
+        """Run all stages on grey images that a queue holds; return the maps and their size.
+
+        Parameters
+        ----------
+        queue : Queue
+            Where to run.
+        images : (2 * H * W,) uint8 or uint16 on the device
+            Left and right image.
+        dtype : numpy dtype
+            Their type.
+        guide : (H * W,) uint8 on the device
+            What edges are taken from.
+        bad : (2 * H * W,) uint8 on the device, or None
+            Not 0 where a pixel has no evidence.
+        shape : (int, int)
+            Height and width, pixels, before halving.
+        ranges : ((int, int), (int, int)) or None
+            As of `stereokit.costs.rows.Pair`.
+        """
         settings = self._settings
         if settings.half:
             guide = halve(queue, "half.guide", guide, np.dtype(np.uint8), 1, shape, False)

@@ -177,7 +177,7 @@ def make(key: str, levels: int, threads: int) -> Call:
     """
     if key in PEERS:
         return PEERS[key].make(levels)
-    matcher = Matcher(key, max_disparity=levels, threads=threads)
+    matcher = Matcher(key, max_disparity=levels, threads=threads, device="cpu")
     return lambda left, right: matcher(left, right).disparity
 
 

@@ -21,11 +21,10 @@ from stereokit.kernels.simd import vector_bits
 from stereokit_evaluation import _versions
 from stereokit_evaluation._peers import HH, PEERS, THREE_WAY, label, usable_levels
 from stereokit_evaluation._rounds import Spread, ratio, spread
+from stereokit_evaluation._sizes import Size
 
 __all__ = [
-    "SIZES",
     "Findings",
-    "Size",
     "as_json",
     "format_ms",
     "load",
@@ -34,25 +33,6 @@ __all__ = [
     "print_tables",
     "versions",
 ]
-
-
-@dataclass(frozen=True)
-class Size:
-    """A problem: `width` x `height` pixels, disparities 0 to `levels` - 1."""
-
-    name: str
-    width: int
-    height: int
-    levels: int
-
-    @property
-    def cells(self) -> int:
-        """Pixels times levels."""
-        return self.width * self.height * self.levels
-
-
-SIZES = {size.name: size for size in (Size("K", 1242, 375, 128), Size("M", 1342, 1110, 256), Size("H", 621, 188, 64))}
-"""KITTI, Middlebury at half size, and KITTI at half size."""
 
 
 @dataclass

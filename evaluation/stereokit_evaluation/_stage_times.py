@@ -89,7 +89,7 @@ def stage_times(
     dict of str to float
         Stages in the order in which they first begin, then `OTHER`, what no stage accounts for, and `TOTAL`.
     """
-    matcher = matching.Matcher(method, max_disparity=levels, threads=1)
+    matcher = matching.Matcher(method, max_disparity=levels, threads=1, device="cpu")
     matcher(left, right)  # compiled before names are replaced: a kernel that is not must not see the stand-ins
     rows: list[dict[str, float]] = []
     for _ in range(rounds):
@@ -108,7 +108,7 @@ def allocated_bytes(method: str, levels: int, left: NDArray[np.uint8], right: ND
 
     Of the third call: by then all buffers are there. Python and numpy count, what OpenCV takes inside does not.
     """
-    matcher = matching.Matcher(method, max_disparity=levels, threads=threads)
+    matcher = matching.Matcher(method, max_disparity=levels, threads=threads, device="cpu")
     for _ in range(2):
         matcher(left, right)
     tracing = tracemalloc.is_tracing()

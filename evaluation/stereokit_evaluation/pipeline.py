@@ -18,7 +18,8 @@ from rich.console import Console
 from stereokit_evaluation import published
 from stereokit_evaluation._peers import HH, PEERS, THREE_WAY, Call, opencv_threads
 from stereokit_evaluation._rounds import Spread, round_robin, spread
-from stereokit_evaluation._speed_report import Size, format_ms, new_table
+from stereokit_evaluation._sizes import Size
+from stereokit_evaluation._speed_report import format_ms, new_table
 from stereokit_evaluation._stage_times import GROUPS, Watch, watched
 from stereokit_evaluation.grid import Configuration, build, describe_error, settings_at_hand
 from stereokit_evaluation.runner import Matching

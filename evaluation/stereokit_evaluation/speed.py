@@ -10,7 +10,6 @@ OpenCV's SGBM and HH modes hardly use a second thread; they are reported for eve
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
@@ -25,12 +24,15 @@ from stereokit.commandline import JsonOption, check_json, write_json
 from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
 from stereokit.io import read_image
+from stereokit.kernels.device import describe
 from stereokit.methods import parse_method
+from stereokit_evaluation import _gpu_report, _gpu_times
 from stereokit_evaluation._peers import PEERS, Call, label, make, opencv_threads, peers
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._progress import progress
 from stereokit_evaluation._rounds import round_robin
-from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, load, machine, print_tables, versions
+from stereokit_evaluation._sizes import Size, parse_sizes, parse_threads
+from stereokit_evaluation._speed_report import Findings, as_json, load, machine, print_tables, versions
 from stereokit_evaluation._stage_times import allocated_bytes, stage_times
 from stereokit_evaluation.grid import settings_at_hand
 from stereokit_evaluation.pipeline import PipelineRow, print_pipeline, time_pipeline
@@ -38,11 +40,10 @@ from stereokit_evaluation.pipeline import as_json as pipeline_json
 from stereokit_evaluation.published import PAPER
 from stereokit_evaluation.scenes import generate
 
-__all__ = ["bench", "parse_sizes", "parse_threads"]
+__all__ = ["bench"]
 
 _FIRST_CALLS = 3
 _MEMORY_SIZES = ("K", "M")
-_MOST_LEVELS = 2048
 
 Gray = NDArray[np.uint8]
 Step = Callable[[str], None]
@@ -52,7 +53,10 @@ def bench(
     with_peers: Annotated[
         bool, typer.Option("--peers/--no-peers", help="Time other libraries that are installed too.")
     ] = True,
-    sizes: Annotated[str, typer.Option(help="K, M, H or WxHxD such as 640x480x64, with commas.")] = "K,M,H",
+    sizes: Annotated[
+        str | None,
+        typer.Option(help="K, M, H or WxHxD such as 640x480x64, with commas; K,M,H by default, K for a GPU."),
+    ] = None,
     threads: Annotated[str, typer.Option(help="Numbers of threads, with commas.")] = "1,2",
     method: Annotated[
         list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat; all four by default.")
@@ -64,6 +68,11 @@ def bench(
     runtimes: Annotated[
         str | None, typer.Option(help="With --pipeline: this refiner in every runtime and precision too.")
     ] = None,
+    device: Annotated[str, typer.Option(help="cpu, or cuda: our methods on the GPU, OpenCV beside them.")] = "cpu",
+    model: Annotated[
+        bool, typer.Option("--model", help="No times but modelled ones: our methods on four GPUs; needs none.")
+    ] = False,
+    scale: Annotated[float, typer.Option(help="With cuda or --model: match at this size, 1 or 0.5.")] = 1.0,
     stages: Annotated[bool, typer.Option("--stages", help="Time the stages of our methods too.")] = False,
     left: Annotated[Path | None, typer.Option(help="Left image, instead of a synthetic one.")] = None,
     right: Annotated[Path | None, typer.Option(help="Right image.")] = None,
@@ -80,24 +89,31 @@ def bench(
 
     Sizes are K = 1242x375 with 128 levels, M = 1342x1110 with 256 and H = 621x188 with 64. The columns "x HH" and
     "x 3WAY" say how many times faster than these modes of OpenCV a method is; below 1 it is slower. MDE/s are
-    millions of pixels times levels per second.
+    millions of pixels times levels per second. --model prints what four GPUs are modelled to take, beside published
+    times: nothing in these tables was measured here.
     """
-    chosen, counts = parse_sizes(sizes), parse_threads(threads)
+    on_gpu = model or device == "cuda"
+    chosen, counts = parse_sizes(sizes or ("K" if on_gpu else "K,M,H")), parse_threads(threads)
     if rounds < 1:
         raise OptionError(f"rounds must be at least 1, got {rounds}")
     check_json(json_file)
+    _check_tables(model, device, pipeline, stages, scale, runtimes)
     if (left is None) != (right is None):
         raise OptionError("left and right go together, got only one of them")
     pictures = None if left is None or right is None else (_read(left), _read(right))
     if pictures is not None and pictures[0].shape != pictures[1].shape:
         raise InputError(f"left and right must have the same size, got {pictures[0].shape} and {pictures[1].shape}")
-    if pipeline and stages:
-        raise OptionError("pipeline and stages are two tables, got both; choose one")
     if pipeline:
         return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, runtimes, json_file)
-    if runtimes is not None:
-        raise OptionError(f"runtimes must come with pipeline, got {runtimes!r} alone")
     methods = list(dict.fromkeys(parse_method(name) for name in method or METHODS))
+    if model:
+        if pictures is not None:
+            raise OptionError(f"left must not come with model, which looks at no image, got {str(left)!r}")
+        return _gpu_report.model(chosen, methods, scale, json_file)
+    build = None
+    if device == "cuda":
+        ours, counts = _gpu_times.contenders(methods, scale), [max(counts)]  # only the peers have threads
+        methods, build, memory, first = list(ours), _gpu_times.maker(ours), False, False
     contenders = [*methods, *(peers() if with_peers else ())]
 
     weighed = [size for size in chosen if (size.name in _MEMORY_SIZES if memory is None else memory)]
@@ -110,7 +126,7 @@ def bench(
                 step(f"{size.name}: images", 0)
                 images = _images(size, pictures)
                 for count in counts:
-                    _time(size, count, contenders, images, findings, step)
+                    _time(size, count, contenders, images, findings, step, build)
                 if size in weighed:
                     _weigh(size, max(counts), contenders, images, findings, step)
                 for name in methods if stages else ():
@@ -127,12 +143,31 @@ def bench(
     options = {
         "sizes": [size.name for size in chosen], "threads": counts, "methods": methods, "rounds": rounds,
         "peers": with_peers, "memory": [size.name for size in weighed], "stages": stages,
+        "device": describe() if device == "cuda" else "cpu", "scale": scale,
         "images": "synthetic" if left is None else [str(left), str(right)],
     }  # fmt: skip
     if not write_json(json_file, as_json(findings, options)):
         print_tables(findings)
+        if device == "cuda":
+            typer.echo(f"GPU: {describe()}")
     if findings.interrupted:
         raise typer.Exit(130)
+
+
+def _check_tables(model: bool, device: str, pipeline: bool, stages: bool, scale: float, runtimes: str | None) -> None:
+    """Refuse options that do not go together."""
+    if device not in ("cpu", "cuda"):
+        raise OptionError(f"device must be 'cpu' or 'cuda', got {device!r}")
+    asked = {"model": model, "device cuda": device == "cuda", "pipeline": pipeline, "stages": stages}
+    tables = [name for name, wanted in asked.items() if wanted]
+    if len(tables) > 1:
+        raise OptionError(f"{tables[0]} and {tables[1]} are two tables, got both; choose one")
+    if scale not in (1, 0.5):
+        raise OptionError(f"scale must be 1 or 0.5, got {scale:g}")
+    if scale != 1 and not (model or device == "cuda"):
+        raise OptionError(f"scale must come with model or device cuda, got {scale:g} alone; see also pipeline")
+    if runtimes is not None and not pipeline:
+        raise OptionError(f"runtimes must come with pipeline, got {runtimes!r} alone")
 
 
 def _pipeline(
@@ -171,46 +206,6 @@ def _pipeline(
         raise typer.Exit(130)
 
 
-def parse_sizes(text: str) -> list[Size]:
-    """Return the sizes named in `text`, such as ``"K,640x480x64"``, each once.
-
-    Raises
-    ------
-    OptionError
-        If one is neither known nor ``WxHxD``, or has no more columns than levels.
-    """
-    found: list[Size] = []
-    for word in (part.strip() for part in text.split(",")):
-        numbers = re.fullmatch(r"(\d{1,6})x(\d{1,6})x(\d{1,6})", word.lower())
-        if word.upper() in SIZES:
-            size = SIZES[word.upper()]
-        elif numbers:
-            width, height, levels = (int(number) for number in numbers.groups())
-            size = Size(f"{width}x{height}x{levels}", width, height, levels)
-            if height < 1 or not 2 <= levels <= _MOST_LEVELS or width <= levels:
-                raise OptionError(
-                    f"sizes must be WxHxD with H of 1 or more, D from 2 to {_MOST_LEVELS} and W above D, got {word!r}"
-                )
-        else:
-            raise OptionError(f"sizes must be K, M, H or WxHxD such as 640x480x64, with commas, got {word!r}")
-        found.append(size)
-    return list(dict.fromkeys(found))
-
-
-def parse_threads(text: str) -> list[int]:
-    """Return the numbers in `text`, such as ``"1,2"``, each once.
-
-    Raises
-    ------
-    OptionError
-        If one is no whole number from 1 to 1024.
-    """
-    words = [word.strip() for word in text.split(",")]
-    if not all(re.fullmatch(r"[0-9]{1,4}", word) and 1 <= int(word) <= 1024 for word in words):
-        raise OptionError(f"threads must be whole numbers from 1 to 1024, with commas, got {text!r}")
-    return list(dict.fromkeys(int(word) for word in words))
-
-
 def _read(path: Path) -> Gray:
     image = read_image(path, gray=True)
     if image.dtype.kind == "f":
@@ -231,16 +226,18 @@ def _images(size: Size, pictures: tuple[Gray, Gray] | None) -> tuple[Gray, Gray]
 
 
 def _time(
-    size: Size, threads: int, contenders: Sequence[str], images: tuple[Gray, Gray], findings: Findings, step: Step
-) -> None:
+    size: Size, threads: int, contenders: Sequence[str], images: tuple[Gray, Gray], findings: Findings, step: Step,
+    build: Callable[[str, int, int], Call] | None = None,
+) -> None:  # fmt: skip
     """Warm everyone up, then time them in turns; the seconds go to ``findings.times``."""
+    build = build or make
     calls: dict[str, Call] = {}
     with opencv_threads(threads):
         for key in contenders:
             step(f"{size.name}, {threads} threads: {label(key)}, first call")
             reason = _too_large(key, size)
             if reason is None:
-                call = make(key, size.levels, threads)
+                call = build(key, size.levels, threads)
                 try:
                     call(*images)
                     calls[key] = call

@@ -294,7 +294,7 @@ def final_kernel(padded: int, others: int) -> Kernel:
     return made
 
 
-for _padded, _others in ((32, 3), (128, 3), (128, 4), (128, 7), (512, 7)):
+for _padded, _others in ((32, 3), (64, 3), (128, 3), (128, 4), (128, 7), (512, 7)):
     final_kernel(_padded, _others)
     paths_kernel(_padded)
 

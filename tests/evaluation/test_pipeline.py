@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from stereokit.errors import OptionError
 from stereokit.registry import REFINERS
 from stereokit_evaluation import pipeline, speed
-from stereokit_evaluation._speed_report import Size
+from stereokit_evaluation._sizes import Size
 from stereokit_refiners import Linear
 
 APP = typer.Typer()

@@ -16,7 +16,8 @@ from stereokit.errors import OptionError, StereokitError, UnknownNameError
 from stereokit_evaluation import _peers, _progress, _speed_report, speed
 from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
 from stereokit_evaluation._rounds import ratio, round_robin, spread
-from stereokit_evaluation._speed_report import SIZES, Findings, Size, as_json, print_tables
+from stereokit_evaluation._sizes import SIZES, Size, parse_sizes, parse_threads
+from stereokit_evaluation._speed_report import Findings, as_json, print_tables
 from stereokit_evaluation._stage_times import OTHER, TOTAL, Watch, stage_times
 
 TINY = "64x48x16"
@@ -35,7 +36,7 @@ def one_peer(monkeypatch):
 
 
 def test_sizes_are_those_of_the_bars():
-    k, m, h = speed.parse_sizes("K,m, H")
+    k, m, h = parse_sizes("K,m, H")
     assert (k.width, k.height, k.levels) == (1242, 375, 128)
     assert (m.width, m.height, m.levels) == (1342, 1110, 256)
     assert (h.width, h.height, h.levels) == (621, 188, 64)
@@ -43,7 +44,7 @@ def test_sizes_are_those_of_the_bars():
 
 
 def test_free_sizes_and_repeats():
-    assert speed.parse_sizes("4000X3000x256,K,4000x3000x256") == [
+    assert parse_sizes("4000X3000x256,K,4000x3000x256") == [
         Size("4000x3000x256", 4000, 3000, 256),
         SIZES["K"],
     ]
@@ -55,14 +56,14 @@ def test_free_sizes_and_repeats():
 )
 def test_bad_sizes_are_refused(text):
     with pytest.raises(OptionError, match="sizes must be"):
-        speed.parse_sizes(text)
+        parse_sizes(text)
 
 
 def test_threads():
-    assert speed.parse_threads("2, 1,2") == [2, 1]
+    assert parse_threads("2, 1,2") == [2, 1]
     for text in ("", "0", "-1", "1.5", "1,,2", "two", "99999"):
         with pytest.raises(OptionError, match="threads must be whole numbers"):
-            speed.parse_threads(text)
+            parse_threads(text)
 
 
 # statistics

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import pkgutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -128,3 +129,16 @@ def test_too_large_a_volume_names_what_is_needed_and_free():
     image = np.zeros((2800, 2900), np.uint8)  # seven volumes of 16.6 GB
     with pytest.raises(DeviceError, match=r"out of device memory: '[\w.]+' needs \d+ bytes, \d+ of \d+ are free"):
         matcher(image, image)
+
+
+def test_the_bench_times_host_and_device_images():
+    from typer.testing import CliRunner
+
+    from stereokit.cli import app
+
+    words = "bench --device cuda --sizes 160x60x32 --method S4 --rounds 2 --no-peers --json -"
+    done = CliRunner().invoke(app, words.split())
+    assert done.exit_code == 0, done.output
+    rows = json.loads(done.stdout)["results"]
+    assert [row["contender"].rpartition(", ")[2] for row in rows] == ["host images", "device images"]
+    assert all(row["median_ms"] > 0 for row in rows)

@@ -39,7 +39,9 @@ def _compare(queue: Any, maps: Any, disparity: np.ndarray, cost: np.ndarray, sur
         np.testing.assert_array_equal(queue.fetch(maps.confidence), sure[: (0, 1, 3)[maps.confident]].ravel())
 
 
-def _winners(sure: np.ndarray, disparity: np.ndarray, cost: np.ndarray, count: int, subpixel: bool, least: float) -> Any:
+def _winners(
+    sure: np.ndarray, disparity: np.ndarray, cost: np.ndarray, count: int, subpixel: bool, least: float
+) -> Any:
     """Return what the CPU writes to: `sure` is its confidence and the two candidates."""
     return winners_like(disparity, cost, sure[0], count, LOWEST, subpixel, least, sure[1:])
 

@@ -1,34 +1,30 @@
-"""What the kernels take of a multiprocessor: registers, stack and spills, from the assembled code.
+"""What the kernels take of a multiprocessor: registers, occupancy and instructions of the hot loop, per architecture.
 
 ``python -m ptx.budgets`` in ``tests/`` prints the table; with ``--write`` it replaces ``budgets.json``, which the tests
 hold the kernels to. PTX for sm_72 runs on every later card, so each kernel is compiled once and assembled four times.
+The hot loop is the longest one, as it was unrolled, or all of a kernel without loops; that of sm_72 is the code for
+sm_75, as `stereokit_evaluation._gpu_code` tells.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import re
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from stereokit_evaluation._gpu_code import ARCHITECTURES, DISASSEMBLED, Code, Resources, code_of, tool, warps_that_fit
+from stereokit_evaluation._gpu_code import resources as taken_by
+
+__all__ = ["ARCHITECTURES", "TABLE", "assembled", "has_tools", "kernels", "ptx", "resources"]
+
 TABLE = Path(__file__).with_name("budgets.json")
-ARCHITECTURES = ("sm_72", "sm_75", "sm_87", "sm_90")
-_REGISTERS = 65536  # of a multiprocessor, on all of these
-_WARPS = {"sm_72": 64, "sm_75": 32, "sm_87": 48, "sm_90": 64}
 
 
-def assembler() -> Path | None:
-    """Return the path of ptxas from the toolkit's wheel, None where it is not installed."""
-    found = importlib.util.find_spec("nvidia")
-    for folder in [] if found is None else found.submodule_search_locations or []:
-        path = Path(folder) / "cuda_nvcc" / "bin" / "ptxas"
-        if path.exists():
-            return path
-    return None
+def has_tools() -> bool:
+    """Return whether kernels can be assembled and disassembled."""
+    return tool("ptxas") is not None and tool("nvdisasm") is not None
 
 
 def kernels() -> dict[str, Any]:
@@ -45,36 +41,48 @@ def ptx(name: str) -> str:
     return str(kernels()[name].ptx((7, 2)))
 
 
+@cache
+def assembled(name: str, architecture: str) -> tuple[Code, Resources]:
+    """Return the code of a kernel and what it takes."""
+    if architecture in DISASSEMBLED:
+        return assembled(name, DISASSEMBLED[architecture])[0], taken_by(ptx(name), architecture)
+    return code_of(ptx(name), architecture)
+
+
 def resources(name: str, architecture: str) -> dict[str, int]:
-    """Return registers, bytes of stack and of spills of a kernel, and the share of warps that fit, percent."""
-    command = [str(assembler()), f"-arch={architecture}", "-v", "-o", "/dev/null", "-"]
-    done = subprocess.run(command, input=ptx(name), capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"{name} for {architecture}: {done.stderr}")
-    registers = int(re.findall(r"Used (\d+) registers", done.stderr)[-1])
-    stack, stores, loads = (int(x) for x in re.findall(
-        r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", done.stderr)[-1])  # fmt: skip
-    in_block = kernels()[name].block // 32
-    blocks = _REGISTERS // (-(-registers // 8) * 8 * 32 * in_block)
-    warps = min(_WARPS[architecture], blocks * in_block)
+    """Return what a kernel takes.
+
+    Registers, bytes of stack and of spills of a thread, the share of warps that fit in percent, and the instructions of
+    the hot loop.
+    """
+    code, taken = assembled(name, architecture)
+    fit, most = warps_that_fit(taken.registers, kernels()[name].block, architecture)
+    first, end = code.hot()
     return {
-        "registers": registers, "stack": stack, "spilled": stores + loads,
-        "occupancy": 100 * warps // _WARPS[architecture],
+        "registers": taken.registers, "stack": taken.stack, "spilled": taken.spilled,
+        "occupancy": 100 * fit // most, "hot_loop": end - first,
     }  # fmt: skip
 
 
 def main(write: bool) -> None:
     """Print the table of all kernels; with `write`, keep it."""
+    kept = ("registers", "occupancy", "hot_loop")
     table = {}
+    print(f"{'':24} registers, occupancy in percent, instructions of the hot loop")
+    print(f"{'kernel':24} " + "  ".join(f"{architecture:>14}" for architecture in ARCHITECTURES))
     for name in sorted(kernels()):
-        table[name] = {arch: resources(name, arch) for arch in ARCHITECTURES}
-        shown = "  ".join(
-            f"{arch} {found['registers']:3d} registers {found['occupancy']:3d} %" for arch, found in table[name].items()
-        )
+        found = {architecture: resources(name, architecture) for architecture in ARCHITECTURES}
+        table[name] = {architecture: {key: one[key] for key in kept} for architecture, one in found.items()}
+        shown = "  ".join(f"{r['registers']:3d} {r['occupancy']:4d} {r['hot_loop']:5d}" for r in found.values())
         print(f"{name:24} {shown}", flush=True)
     if write:
-        text = json.dumps({n: {a: r["registers"] for a, r in row.items()} for n, row in table.items()}, indent=1)
-        TABLE.write_text(text + "\n", encoding="utf-8")
+        rows = (
+            f" {json.dumps(name)}: {{\n"
+            + ",\n".join(f"  {json.dumps(arch)}: {json.dumps(one)}" for arch, one in row.items())
+            + "\n }"
+            for name, row in table.items()
+        )
+        TABLE.write_text("{\n" + ",\n".join(rows) + "\n}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

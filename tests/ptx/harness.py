@@ -71,6 +71,7 @@ class Report:
     """What a launch did."""
 
     instructions: int  # of threads, counted in whole straight runs
+    issued: int  # the same of warps
     read: tuple[int, ...]  # bytes of each array argument, as the threads asked for them
     written: tuple[int, ...]
 
@@ -141,7 +142,7 @@ def run(
     machine = Machine(made, blocks, block or kernel.block, parameters, regions, seed, max_runs)
     machine.run()
     order = [regions[places[number][0]] for number in sorted(places)]
-    return Report(machine.instructions, tuple(r.read for r in order), tuple(r.written for r in order))
+    return Report(machine.instructions, machine.issued, tuple(r.read for r in order), tuple(r.written for r in order))
 
 
 def _root(values: np.ndarray) -> np.ndarray:

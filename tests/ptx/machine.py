@@ -63,6 +63,7 @@ class Machine:
         self.everyone = np.arange(self.count, dtype=np.int32)
         self.registers = {name: np.zeros(self.count, kind) for name, kind in program.registers.items()}
         self.instructions = 0  # of threads
+        self.issued = 0  # of warps, whose lanes part where they branch
 
     @staticmethod
     def _own(name: str, size: int, owners: int, garbage: Any, traced: bool) -> Region:
@@ -115,6 +116,7 @@ class Machine:
             function, meets, length = self.translation.function(place)
             number = self.count if lanes is None else lanes.size
             self.instructions += length * number
+            self.issued += length * self._warps(lanes)
             if meets:
                 out = function(self, self.registers, lanes, number, entry_whole or self._whole(lanes))
             else:
@@ -204,6 +206,12 @@ class Machine:
             return False
         rows = lanes.reshape(-1, 32)
         return bool(((rows[:, 0] % 32 == 0) & (rows[:, 31] - rows[:, 0] == 31)).all())
+
+    def _warps(self, lanes: Any) -> int:
+        """Return how many warps the lanes belong to; they are in order."""
+        if lanes is None:
+            return int(self.threads.warp_syncs.size)
+        return 1 + int(np.count_nonzero(np.diff(self.threads.warp_of[lanes])))
 
     def _mask(self, place: int, lanes: Any) -> Any:
         one = self.translation.program.code[place]

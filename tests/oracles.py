@@ -384,11 +384,12 @@ def phases_to_pixels(phases):
     return out
 
 
-def mixture(values, logits, residual, offsets):
+def mixture(values, logits, residual, offsets, others):
     """Full-size map in which each pixel is a softmax-weighted mean of half-size values around it, plus a residual.
 
-    `values` is (h, w); `logits` (number of offsets, 4, h, w), the second axis the phase; `residual` (4, h, w).
-    Neighbours beyond the border are the nearest pixel of the border.
+    `values` is (h, w); `others` (n, h, w) are values of the pixel itself that come after those at the offsets; `logits`
+    (number of values, 4, h, w), the second axis the phase; `residual` (4, h, w). Neighbours beyond the border are the
+    nearest pixel of the border.
     """
     height, width = values.shape
     out = np.empty((2 * height, 2 * width))
@@ -398,8 +399,10 @@ def mixture(values, logits, residual, offsets):
             highest = max(float(v) for v in logits[:, phase, y, x])
             shares = [math.exp(float(v) - highest) for v in logits[:, phase, y, x]]
             total = 0.0
-            for share, (dy, dx) in zip(shares, offsets, strict=True):
+            for share, (dy, dx) in zip(shares, offsets, strict=False):
                 total += share * float(values[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)])
+            for share, other in zip(shares[len(offsets) :], others, strict=True):
+                total += share * float(other[y, x])
             out[row, column] = total / sum(shares) + float(residual[phase, y, x])
     return out
 

@@ -60,13 +60,16 @@ def coarse_of(size, seed=0, gaps=0.0, low=2.0, high=30.0):
     disparity = (low + (high - low) * rough).astype(np.float32)
     disparity[rng.random(shape) < gaps] = NAN
     valid = ~np.isnan(disparity) & (rng.random(shape) < 0.85)
-    return Disparity(disparity, valid, np.where(valid, rng.random(shape), 0).astype(np.float32))
+    confidence = np.where(valid, rng.random(shape), 0).astype(np.float32)
+    candidates = (low + (high - low) * rng.random((2, *shape))).astype(np.float32)
+    return Disparity(disparity, valid, confidence, candidates=candidates)
 
 
 def sure(disparity, valid=None):
-    """Return a map of which all that is valid, or all of it, was measured with full confidence."""
+    """Return a map of which all that is valid, or all of it, was measured with full confidence and without rivals."""
     valid = np.ones(disparity.shape, bool) if valid is None else valid
-    return Disparity(disparity, valid, valid.astype(np.float32))
+    candidates = np.nan_to_num(np.stack([disparity] * 2))
+    return Disparity(disparity, valid, valid.astype(np.float32), candidates=candidates)
 
 
 def image_of(size, seed=0):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 import threading
 
@@ -56,44 +57,48 @@ def exact(request):
 @pytest.mark.parametrize("size", SIZES)
 def test_shapes_types_and_untouched_inputs(refiner, size):
     coarse, left = coarse_of(size, gaps=0.1), image_of(size)
-    kept = [np.copy(a) for a in (coarse.disparity, coarse.valid, coarse.confidence, left)]
+    kept = [np.copy(a) for a in (*vars(coarse).values(), left) if a is not None]
     fine = refiner(coarse, left)
     for array, dtype in ((fine.disparity, np.float32), (fine.valid, np.bool_), (fine.confidence, np.float32)):
         assert array.shape == size
         assert array.dtype == dtype
-    for before, after in zip(kept, (coarse.disparity, coarse.valid, coarse.confidence, left), strict=True):
+    for before, after in zip(kept, (a for a in (*vars(coarse).values(), left) if a is not None), strict=True):
         np.testing.assert_array_equal(before, after)
     for mine in (fine.disparity, fine.valid, fine.confidence):
-        for theirs in (coarse.disparity, coarse.valid, coarse.confidence, left):
+        for theirs in (coarse.disparity, coarse.valid, coarse.confidence, coarse.candidates, left):
             assert not np.shares_memory(mine, theirs)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_refiners_say_whether_they_need_a_confidence(name):
+def test_refiners_say_what_they_need_beside_the_map(name):
     refiner = LearnedRefiner.of(random_content(name))
-    assert refiner.needs_confidence is ("confidence" in NETWORKS[name].inputs)
-    assert refiner.needs_confidence is (name == "stereokit")
+    for needs, what in ((refiner.needs_confidence, "confidence"), (refiner.needs_candidates, "candidates")):
+        assert needs is (what in NETWORKS[name].inputs)
+        assert needs is (name == "stereokit")
 
 
-def test_a_map_without_confidence_is_refined_without_or_refused(refiner):
+@pytest.mark.parametrize("missing", ["confidence", "candidates"])
+def test_a_bare_map_is_refined_without_or_refused(refiner, missing):
     coarse, left = coarse_of((18, 30)), image_of((18, 30))
-    bare = Disparity(coarse.disparity, coarse.valid)
+    bare = dataclasses.replace(coarse, **{missing: None})
     if not refiner.needs_confidence:
         fine = refiner(bare, left)
-        assert fine.confidence is None
+        assert (fine.confidence is None) == (missing == "confidence") and fine.candidates is None
         np.testing.assert_array_equal(fine.disparity, refiner(coarse, left).disparity)
         return
     with pytest.raises(OptionError) as caught:
         refiner(bare, left)
-    rule = "coarse must come with a confidence for this refiner (Matcher(confidence=True)), got none"
+    rule = f"coarse must come with {missing} for this refiner, as stereokit.Matcher gives it, got none"
     assert one_line(caught.value) == rule
 
 
-def test_the_confidence_decides_where_it_is_looked_at_and_nowhere_else(exact):
+@pytest.mark.parametrize("what", ["confidence", "candidates"])
+def test_confidence_and_candidates_decide_where_they_are_looked_at_and_nowhere_else(exact, what):
     coarse, left = coarse_of((32, 48)), image_of((32, 48))
-    doubted = coarse.confidence.copy()
-    doubted[4:8, 4:8] = 1 - doubted[4:8, 4:8]
-    moved = exact(Disparity(coarse.disparity, coarse.valid, doubted), left).disparity != exact(coarse, left).disparity
+    changed = getattr(coarse, what).copy()
+    changed[..., 4:8, 4:8] = 1 - changed[..., 4:8, 4:8]
+    other = dataclasses.replace(coarse, **{what: changed})
+    moved = exact(other, left).disparity != exact(coarse, left).disparity
     assert moved.any() == exact.needs_confidence
 
 
@@ -144,6 +149,7 @@ def test_odd_sizes_are_the_image_extended_by_hand_and_cut(exact, size):
         np.pad(coarse.disparity, ((0, below), (0, beside)), mode="edge"),
         np.pad(coarse.valid, ((0, below), (0, beside)), mode="edge"),
         np.pad(coarse.confidence, ((0, below), (0, beside)), mode="edge"),
+        candidates=np.pad(coarse.candidates, ((0, 0), (0, below), (0, beside)), mode="edge"),
     )
     whole = 2 * (height + below), 2 * (width + beside)
     extended = np.pad(left, ((0, whole[0] - rows), (0, whole[1] - columns)), mode="edge")
@@ -163,7 +169,7 @@ def test_gaps_stay_gaps_and_the_network_sees_them_filled(exact):
     np.testing.assert_array_equal(fine.valid, coarse.valid[y // 2, x // 2])
     np.testing.assert_array_equal(fine.confidence, coarse.confidence[y // 2, x // 2])
     filled = oracles.fill(coarse.disparity, "nearest").astype(np.float32)
-    dense = Disparity(filled, coarse.valid, coarse.confidence)
+    dense = dataclasses.replace(coarse, disparity=filled)
     np.testing.assert_array_equal(exact(dense, left).disparity[~gap], fine.disparity[~gap])
 
 

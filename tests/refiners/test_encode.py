@@ -10,7 +10,7 @@ from refining import one_line
 from stereokit.errors import OptionError
 from stereokit_refiners.encode import FORMS, check_form, encode, half_image
 
-ALL = ("disparity", "image", "confidence", "phases")
+ALL = ("disparity", "image", "confidence", "candidates", "phases")
 
 
 def given(rows, columns, dtype=np.uint8, seed=0):
@@ -19,7 +19,8 @@ def given(rows, columns, dtype=np.uint8, seed=0):
     left = rng.integers(0, 256, (2 * rows, 2 * columns)).astype(dtype)
     confidence = rng.random((rows, columns), np.float32)
     confidence[rng.random((rows, columns)) < 0.3] = 0
-    return disparity, confidence, left
+    candidates = (rng.random((2, rows, columns)) * 90 - 10).astype(np.float32)
+    return disparity, left, confidence, candidates
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
@@ -27,52 +28,54 @@ def given(rows, columns, dtype=np.uint8, seed=0):
 @pytest.mark.parametrize("form", FORMS)
 def test_every_input_against_its_formula(form, size, dtype):
     rows, columns = size
-    disparity, confidence, left = given(rows, columns, dtype)
-    kept = disparity.copy(), confidence.copy(), left.copy()
-    found = encode(ALL, form, disparity, confidence, left)
+    disparity, left, confidence, candidates = arrays = given(rows, columns, dtype)
+    kept = [array.copy() for array in arrays]
+    found = encode(ALL, form, disparity, left, confidence, candidates)
     assert list(found) == list(ALL)
     gray = (lambda v: v / 255) if form == "literal" else (lambda v: 4 * (v / 255 - 0.4))
     for y in range(rows):
         for x in range(columns):
-            d = float(disparity[y, x])
-            assert found["disparity"][0, y, x] == pytest.approx(
-                d / 256 if form == "literal" else d / 16 - 1.5, abs=1e-6
-            )
+            pixels = [*candidates[:, y, x], disparity[y, x]]
+            scaled = [float(d) / 256 if form == "literal" else float(d) / 16 - 1.5 for d in pixels]
+            assert found["disparity"][0, y, x] == pytest.approx(scaled[2], abs=1e-6)
+            assert list(found["candidates"][:, y, x]) == pytest.approx(scaled[:2], abs=1e-6)
             assert found["confidence"][0, y, x] == pytest.approx(4 * float(confidence[y, x]) - 2, abs=1e-6)
             four = [float(left[2 * y + i, 2 * x + j]) for i in (0, 1) for j in (0, 1)]
             assert found["image"][0, y, x] == pytest.approx(gray(sum(four) / 4), abs=2e-6)
             for k in range(4):
                 assert found["phases"][k, y, x] == pytest.approx(gray(four[k]), abs=2e-6)
-    for name, channels in {"disparity": 1, "image": 1, "confidence": 1, "phases": 4}.items():
+    for name, channels in {"disparity": 1, "image": 1, "confidence": 1, "candidates": 2, "phases": 4}.items():
         assert found[name].shape == (channels, rows, columns)
         assert found[name].dtype == np.float32
         assert found[name].flags.c_contiguous
-    for before, after in zip(kept, (disparity, confidence, left), strict=True):
+    for before, after in zip(kept, arrays, strict=True):
         np.testing.assert_array_equal(before, after)
 
 
 def test_only_what_is_asked_for_is_made():
-    disparity, confidence, left = given(4, 4)
     names = ("confidence", "disparity")
-    assert list(encode(names, "residual", disparity, confidence, left)) == list(names)
+    assert list(encode(names, "residual", *given(4, 4))) == list(names)
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_what_was_not_measured_is_minus_2_and_what_is_certain_2(form):
     confidence = np.float32([[0, 0.5, 1]])
-    found = encode(("confidence",), form, np.zeros((1, 3), np.float32), confidence, np.zeros((2, 6), np.uint8))
+    found = encode(("confidence",), form, np.zeros((1, 3), np.float32), np.zeros((2, 6), np.uint8), confidence)
     np.testing.assert_array_equal(found["confidence"], [[[-2, 0, 2]]])
 
 
-def test_no_confidence_is_refused_only_where_it_is_looked_at():
-    disparity, confidence, left = given(4, 4)
-    names = ("disparity", "image", "phases")
-    without, beside = (encode(names, "residual", disparity, c, left) for c in (None, confidence))
+@pytest.mark.parametrize("missing", ["confidence", "candidates"])
+def test_what_is_missing_is_refused_only_where_it_is_looked_at(missing):
+    disparity, left, confidence, candidates = given(4, 4)
+    evidence = {"confidence": confidence, "candidates": candidates}
+    names = tuple(name for name in ALL if name != missing)
+    without, beside = (encode(names, "residual", disparity, left, **{**evidence, missing: m}) for m in
+                       (None, evidence[missing]))  # fmt: skip
     for name in names:
         np.testing.assert_array_equal(without[name], beside[name])
     with pytest.raises(OptionError) as caught:
-        encode(ALL, "residual", disparity, None, left)
-    rule = "coarse must come with a confidence for this refiner (Matcher(confidence=True)), got none"
+        encode(ALL, "residual", disparity, left, **{**evidence, missing: None})
+    rule = f"coarse must come with {missing} for this refiner, as stereokit.Matcher gives it, got none"
     assert one_line(caught.value) == rule
 
 
@@ -85,10 +88,10 @@ def test_half_image_is_the_mean_of_four_without_rounding():
 
 
 def test_strided_images_are_read_where_they_are():
-    disparity, confidence, left = given(4, 6)
+    disparity, left, *evidence = given(4, 6)
     wide = np.zeros((8, 24), np.uint8)
     wide[:, ::2] = left
-    plain, strided = (encode(ALL, "residual", disparity, confidence, image) for image in (left, wide[:, ::2]))
+    plain, strided = (encode(ALL, "residual", disparity, image, *evidence) for image in (left, wide[:, ::2]))
     for name in ALL:
         np.testing.assert_array_equal(plain[name], strided[name])
 

@@ -41,10 +41,11 @@ def failed(result, *parts):
 def feeds(content, size):
     coarse, left = coarse_of(size, 4), image_of(size, 4)
     given = {"coarse": coarse.disparity, "left": left.astype(np.float32), "confidence": coarse.confidence}
-    if "confidence" not in NETWORKS[content.network].inputs:
-        del given["confidence"]
+    given["candidates"] = coarse.candidates
+    for name in {"confidence", "candidates"} - NETWORKS[content.network].inputs.keys():
+        del given[name]
     refined = LearnedRefiner.of(content, precision="fp32")(coarse, left).disparity
-    return {name: array[None, None] for name, array in given.items()}, refined
+    return {name: array.reshape(1, -1, *array.shape[-2:]) for name, array in given.items()}, refined
 
 
 @pytest.mark.parametrize(("name", "form"), FORMS)
@@ -228,9 +229,10 @@ def test_exported_graphs_take_maps_without_gaps_only_as_documented():
     for level in (1, 0.4, 0):
         confidence = np.full(half_of(size), level, np.float32)
         given = {"coarse": coarse.disparity, "confidence": confidence, "left": left.astype(np.float32)}
-        maps.append(session.run(None, {k: v[None, None] for k, v in given.items()})[0][0, 0])
+        given["candidates"] = coarse.candidates
+        maps.append(session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in given.items()})[0][0, 0])
         refined = LearnedRefiner.of(content, precision="fp32")(
-            Disparity(coarse.disparity, confidence > 0, confidence), left
+            Disparity(coarse.disparity, confidence > 0, confidence, candidates=coarse.candidates), left
         )
         np.testing.assert_allclose(maps[-1], refined.disparity, rtol=0, atol=module.TOLERANCE_PX)
     for one, other in itertools.combinations(maps, 2):

@@ -158,7 +158,7 @@ def stereovae_by_loops(arrays, x0, x1, latent):
     return deconv("Y", d, x0, fe_1, fe_2, activate=False), mean, log_sigma
 
 
-def pyramid_by_loops(arrays, disparity, confidence, phases):
+def pyramid_by_loops(arrays, disparity, confidence, phases, candidates):
     def conv(name, *inputs, stride=1, activate=True):
         y = oracles.convolve(np.concatenate(inputs), arrays[f"{name}.weight"], arrays[f"{name}.bias"], stride)
         return oracles.leaky(y) if activate else y
@@ -171,7 +171,7 @@ def pyramid_by_loops(arrays, disparity, confidence, phases):
         _, height, width = low.shape
         return oracles.leaky(skip + np.stack([oracles.double(plane, 2 * height, 2 * width) for plane in low]))
 
-    a = conv("stem", disparity, confidence, phases)
+    a = conv("stem", disparity, confidence, phases, candidates)
     b = block("block_1", conv("down_1", a, stride=2))
     c = block("block_2", conv("down_2", b, stride=2))
     d = block("block_3", conv("down_3", c, stride=2))
@@ -215,7 +215,10 @@ def test_the_pyramid_is_what_loops_compute():
     arrays, inputs = random_arrays("stereokit", 2, last=1.0), encoded_of("stereokit", 8, 16)
     heads = heads_of(module_of("stereokit", arrays), inputs)
     assert list(heads) == ["map"]
-    close(heads["map"], pyramid_by_loops(arrays, *(inputs[n] for n in ("disparity", "confidence", "phases"))))
+    close(
+        heads["map"],
+        pyramid_by_loops(arrays, *(inputs[n] for n in ("disparity", "confidence", "phases", "candidates"))),
+    )
 
 
 def test_the_latent_is_its_mean_at_inference_and_drawn_in_training():
@@ -277,7 +280,8 @@ def test_gradients_reach_every_weight(name):
     module = Module(NETWORKS[name], torch.Generator().manual_seed(0)).train()
     inputs = {key: torch.from_numpy(a)[None] for key, a in encoded_of(name, 16, 16).items()}
     heads = module(inputs)
-    loss = compose(name, "residual", heads["map"], inputs["disparity"] * 10 + 20).square().mean()
+    values = torch.rand(1, 2, 16, 16) * 30
+    loss = compose(name, "residual", heads["map"], inputs["disparity"] * 10 + 20, values).square().mean()
     if "log_sigma" in heads:
         loss = loss + heads["log_sigma"].square().mean()
     loss.backward()

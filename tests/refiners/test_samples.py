@@ -10,10 +10,10 @@ import pytest
 
 import stereokit
 from stereokit_refiners import samples
-from stereokit_refiners.samples import Pair, Sample, crop, half, make_variant, whole
+from stereokit_refiners.samples import Pair, Sample, crop, make_variant, whole
 
 NAN = np.nan
-FIELDS = ("disparity", "confidence", "left", "truth", "weight")
+FIELDS = ("disparity", "confidence", "candidates", "left", "truth", "weight")
 
 
 def pair_of(size=(72, 120), shift=10, seed=0):
@@ -52,6 +52,8 @@ def assert_same(one, other):
 
 
 class Keeping:
+    needs_candidates = True
+
     def __call__(self, coarse, left, *, threads=1):
         self.coarse = coarse
         return stereokit.Disparity(np.zeros(left.shape, np.float32), np.ones(left.shape, bool))
@@ -70,6 +72,9 @@ def test_variant_0_is_what_a_half_size_matcher_computes_inside(method, levels, s
     found = make_variant(pair, method, 0, 0, levels)
     expected = np.clip(np.rint(keeping.coarse.disparity * 256), 0, 65535).astype(np.uint16)
     np.testing.assert_array_equal(found.coarse, expected)
+    kept = np.clip(np.rint(keeping.coarse.candidates * 256), 0, 65535)
+    assert found.candidates.dtype == np.uint16
+    np.testing.assert_array_equal(found.candidates, kept)
     assert found.confidence.dtype == np.uint8
     np.testing.assert_array_equal(found.confidence, np.rint(keeping.coarse.confidence * 255))
     assert (found.confidence[~keeping.coarse.valid] == 0).all() and len(np.unique(found.confidence)) > 20
@@ -181,11 +186,6 @@ def test_digests_tell_pairs_apart(pair):
     assert dataclasses.replace(pair, occ=pair.noc).digest != pair.digest
 
 
-def test_half_is_the_mean_of_four():
-    image = (np.random.default_rng(0).integers(0, 64, (6, 8)) * 4).astype(np.uint8)
-    np.testing.assert_array_equal(half(image), image.reshape(3, 2, 4, 2).mean(axis=(1, 3)))
-
-
 # --- crops ---------------------------------------------------------------------------------------------------------
 
 
@@ -210,7 +210,8 @@ def numbered(rows, columns):
     truth = (128 * large_y + large_x + 1).astype(np.uint16)
     left = ((large_y + large_x) % 200 + 20).astype(np.uint8)
     confidence = (coarse * 37 % 256).astype(np.uint8)
-    return Sample(coarse, confidence, left, truth, truth % 5 > 0, (2 * rows, 2 * columns))
+    candidates = np.stack([coarse + 7, coarse * 3 % 5000]).astype(np.uint16)
+    return Sample(coarse, confidence, candidates, left, truth, truth % 5 > 0, (2 * rows, 2 * columns))
 
 
 def test_crops_keep_map_truth_and_mask_together():
@@ -223,6 +224,7 @@ def test_crops_keep_map_truth_and_mask_together():
         places.add((y, x))
         np.testing.assert_array_equal(part.disparity, sample.coarse[y : y + 8, x : x + 16] / 128)
         np.testing.assert_allclose(part.confidence, sample.confidence[y : y + 8, x : x + 16] / 255, rtol=1e-6)
+        np.testing.assert_array_equal(part.candidates, sample.candidates[:, y : y + 8, x : x + 16] / 128)
         large = np.s_[2 * y : 2 * y + 16, 2 * x : 2 * x + 32]
         np.testing.assert_array_equal(part.truth, sample.truth[large] / 256)
         np.testing.assert_array_equal(part.weight, np.where(sample.seen[large], 2, 1))
@@ -257,7 +259,8 @@ def test_the_same_random_state_is_the_same_crop():
 def test_small_samples_are_extended_without_weight():
     sample = numbered(5, 20)
     part = crop(sample, 8, 24, np.random.default_rng(0))
-    assert part.disparity.shape == part.confidence.shape == (8, 24)
+    assert part.disparity.shape == part.confidence.shape == part.candidates.shape[1:] == (8, 24)
+    np.testing.assert_array_equal(part.candidates[:, 5:, :20], np.repeat(part.candidates[:, 4:5, :20], 3, 1))
     assert part.left.shape == part.truth.shape == part.weight.shape == (16, 48)
     assert (part.weight[:10, :40] > 0).all()
     assert (part.weight[10:] == 0).all() and (part.weight[:, 40:] == 0).all()
@@ -282,6 +285,8 @@ def test_whole_is_everything_on_a_multiple(size, multiple, expected):
     assert part.left.shape == part.weight.shape == (2 * expected[0], 2 * expected[1])
     np.testing.assert_array_equal(part.disparity[:rows, :columns], sample.coarse / 128)
     np.testing.assert_allclose(part.confidence[:rows, :columns], sample.confidence / 255, rtol=1e-6)
+    np.testing.assert_array_equal(part.candidates[:, :rows, :columns], sample.candidates / 128)
+    assert part.candidates.shape == (2, *expected)
     assert part.confidence.shape == expected and part.confidence.dtype == np.float32
     np.testing.assert_array_equal(part.left[: 2 * rows, : 2 * columns], sample.left)
     assert part.weight[2 * rows :].sum() == 0 and part.weight[:, 2 * columns :].sum() == 0

@@ -213,13 +213,11 @@ def test_a_file_with_a_wrong_bit(path, at):
     assert "CRC" in refused(path)
 
 
-def test_a_sample_of_an_older_version(path):
-    """It had a mask where there is a confidence now."""
+@pytest.mark.parametrize("missing", ["confidence", "candidates"])
+def test_a_sample_of_an_older_version(path, missing):
     sample = vars(Shelf([path])[0])
-    np.savez(
-        path, allow_pickle=False, **{"valid" if k == "confidence" else k: np.asarray(v) for k, v in sample.items()}
-    )
-    assert "confidence" in refused(path)
+    np.savez(path, allow_pickle=False, **{k: np.asarray(v) for k, v in sample.items() if k != missing})
+    assert missing in refused(path)
 
 
 def test_a_sample_never_runs_code(path):

@@ -36,25 +36,34 @@ def test_tensors_give_what_arrays_give(name, form, size, device):
     content, coarse, left = random_content(name, form=form), coarse_of(size), image_of(size)
     expected = LearnedRefiner.of(content, backend="torch")(coarse, left).disparity
     refiner = TensorRefiner(content, device)
-    given = [torch.from_numpy(array).to(device) for array in (coarse.disparity, coarse.confidence, left)]
+    given = [
+        torch.from_numpy(array).to(device) for array in (coarse.disparity, coarse.confidence, left, coarse.candidates)
+    ]
     kept = [tensor.clone() for tensor in given]
     found = refiner(*given)
     assert found.shape == size and found.dtype == torch.float32 and found.is_contiguous()
     assert found.device.type == device
     np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=TOLERANCE_PX)
     assert all(torch.equal(a, b) for a, b in zip(given, kept, strict=True))
-    again = refiner(coarse.disparity, coarse.confidence, left)  # arrays of the host are taken too
+    again = refiner(coarse.disparity, coarse.confidence, left, coarse.candidates)  # arrays of the host are taken too
     assert torch.equal(again, found)
 
 
-def test_only_networks_that_look_at_the_confidence_need_it():
+def test_only_networks_that_look_at_the_confidence_and_candidates_need_them():
     coarse, left = coarse_of((16, 24)), image_of((16, 24))
     for name in ("cnn", "stereovae"):
         refiner = TensorRefiner(random_content(name), "cpu")
         given = refiner(coarse.disparity, coarse.confidence, left)
         assert torch.equal(refiner(coarse.disparity, None, left), given)
+        assert torch.equal(refiner(coarse.disparity, None, left, coarse.candidates), given)
+    refiner = TensorRefiner(random_content("stereokit"), "cpu")
     with pytest.raises(InputError, match=r"^confidence must be given for refiner 'stereokit', got None$"):
-        TensorRefiner(random_content("stereokit"), "cpu")(coarse.disparity, None, left)
+        refiner(coarse.disparity, None, left, coarse.candidates)
+    with pytest.raises(InputError, match=r"^candidates must be given for refiner 'stereokit', got None$"):
+        refiner(coarse.disparity, coarse.confidence, left)
+    rule = r"^candidates must be two maps of the shape of coarse \(8, 12\), got \(1, 8, 12\)$"
+    with pytest.raises(InputError, match=rule):
+        refiner(coarse.disparity, coarse.confidence, left, coarse.candidates[:1])
 
 
 def test_the_device_needs_torch(monkeypatch):
@@ -63,7 +72,7 @@ def test_the_device_needs_torch(monkeypatch):
     coarse = coarse_of((16, 24))
     for refiner in (Linear(), LearnedRefiner.of(random_content("cnn"))):
         with pytest.raises(StereokitError, match="refiners on the GPU need torch, which is not installed"):
-            refiner.on_device(coarse.disparity, coarse.valid, None, image_of((16, 24)), 0)
+            refiner.on_device(coarse, image_of((16, 24)), 0)
 
 
 def test_a_file_is_taken_by_its_path(tmp_path):

@@ -46,13 +46,15 @@ def sample_of(seed=0, size=(24, 40), offset=6.0, known=0.8):
     seen = (truth > 0) & (rng.random(truth.shape) < 0.9)
     confidence = rng.integers(0, 256, (rows, columns)).astype(np.uint8)
     confidence[rng.random((rows, columns)) > 0.9] = 0
-    return Sample(coarse, confidence, left, truth.astype(np.uint16), seen, size)
+    candidates = rng.integers(0, 40 * 256, (2, rows, columns)).astype(np.uint16)
+    return Sample(coarse, confidence, candidates, left, truth.astype(np.uint16), seen, size)
 
 
 def coarse_map(sample):
     """Return what a matcher gave for a sample, before it was packed."""
     confidence = sample.confidence.astype(np.float32) / 255
-    return Disparity(sample.coarse.astype(np.float32) / 256, confidence > 0, confidence)
+    coarse, candidates = (array.astype(np.float32) / 256 for array in (sample.coarse, sample.candidates))
+    return Disparity(coarse, confidence > 0, confidence, candidates=candidates)
 
 
 SAMPLES = [sample_of(seed) for seed in range(3)]
@@ -155,8 +157,8 @@ def test_bad_pixels_are_those_of_kitti(occluded):
 def test_exactly_3_pixels_and_exactly_5_percent_are_good():
     def counts(true, error):
         truth = np.full((2, 2), round(true * 256), np.uint16)
-        one = Sample(np.zeros((1, 1), np.uint16), np.full((1, 1), 255, np.uint8), np.zeros((2, 2), np.uint8), truth,
-                     np.ones((2, 2), bool), (2, 2))  # fmt: skip
+        one = Sample(np.zeros((1, 1), np.uint16), np.full((1, 1), 255, np.uint8), np.zeros((2, 1, 1), np.uint16),
+                     np.zeros((2, 2), np.uint8), truth, np.ones((2, 2), bool), (2, 2))  # fmt: skip
         return bad_pixels(np.full((2, 2), true + error, np.float32), one)
 
     assert counts(20, 3.0) == (0, 4)
@@ -204,7 +206,8 @@ def test_batches_are_functions_of_seed_step_and_rank():
 
     first = draw(5)
     assert {k: tuple(v.shape) for k, v in first.items()} == {
-        "disparity": (2, 1, 8, 16), "confidence": (2, 1, 8, 16), "phases": (2, 4, 8, 16), "coarse": (2, 1, 8, 16),
+        "disparity": (2, 1, 8, 16), "confidence": (2, 1, 8, 16), "phases": (2, 4, 8, 16),
+        "candidates": (2, 2, 8, 16), "values": (2, 2, 8, 16), "coarse": (2, 1, 8, 16),
         "truth": (2, 1, 16, 32), "weight": (2, 1, 16, 32),
     }  # fmt: skip
     for name, tensor in draw(5).items():

@@ -40,6 +40,8 @@ def matcher(**given):
 class Keeping:
     """A refiner that keeps what it was given."""
 
+    needs_candidates = True
+
     def __call__(self, coarse, left, *, threads=1):
         self.coarse, self.left, self.threads = coarse, left, threads
         return stereokit.Disparity(np.zeros(left.shape, np.float32), np.ones(left.shape, bool))

@@ -19,8 +19,8 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 demo: $(VENV)/.user  ## match a synthetic street with S1 to S4: pictures in demo/ and a table
 	$(BIN)/stereokit demo --output demo
 
-test: $(VENV)/.dev  ## all tests
-	$(BIN)/python -m pytest
+test: $(VENV)/.dev  ## all tests, two files at a time
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 docs: $(VENV)/.dev  ## the documentation, in docs/_build/html; warnings are errors
 	NUMBA_CACHE_DIR=$(CURDIR)/.numba_cache $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs docs/_build/html

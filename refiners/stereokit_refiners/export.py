@@ -103,7 +103,7 @@ def largest_difference(content: WeightFile, model: bytes) -> float:
     coarse[16:32, 20:50] += 8
     confidence = np.maximum(rng.random((rows, columns), np.float32) - np.float32(0.1), np.float32(0))
     left = rng.integers(0, 256, (2 * rows, 2 * columns), dtype=np.uint8)
-    two = np.stack([coarse, coarse[::-1]]) + rng.random((2, rows, columns), np.float32)
+    two = np.stack([coarse, coarse[:, ::-1]]) + rng.random((2, rows, columns), np.float32)  # the rival is far off
     refined = _reference(content, Disparity(coarse, confidence > 0, confidence, candidates=two), left)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     feeds = {"coarse": coarse, "confidence": confidence, "candidates": two, "left": left.astype(np.float32)}

@@ -81,7 +81,7 @@ def test_refiners_say_what_they_need_beside_the_map(name):
 def test_a_bare_map_is_refined_without_or_refused(refiner, missing):
     coarse, left = coarse_of((18, 30)), image_of((18, 30))
     bare = dataclasses.replace(coarse, **{missing: None})
-    if not refiner.needs_confidence:
+    if not getattr(refiner, f"needs_{missing}"):
         fine = refiner(bare, left)
         assert (fine.confidence is None) == (missing == "confidence") and fine.candidates is None
         np.testing.assert_array_equal(fine.disparity, refiner(coarse, left).disparity)
@@ -99,7 +99,7 @@ def test_confidence_and_candidates_decide_where_they_are_looked_at_and_nowhere_e
     changed[..., 4:8, 4:8] = 1 - changed[..., 4:8, 4:8]
     other = dataclasses.replace(coarse, **{what: changed})
     moved = exact(other, left).disparity != exact(coarse, left).disparity
-    assert moved.any() == exact.needs_confidence
+    assert moved.any() == getattr(exact, f"needs_{what}")
 
 
 @pytest.mark.parametrize("size", [(33, 47), (1, 9)])

@@ -155,6 +155,40 @@ def test_a_graph_that_is_not_the_refiner_is_not_written(tmp_path, monkeypatch):
     assert not out.exists()
 
 
+def with_swapped_candidates(content):
+    first = content.arrays["head.weight"].shape[0] - 8  # the logits of the two candidates are the last, four each
+    for array in (content.arrays["head.weight"], content.arrays["head.bias"]):
+        array[first:] = np.concatenate([array[first + 4 :], array[first : first + 4]])
+
+
+def with_unseen_candidates(content):
+    content.arrays["stem.weight"][:, -2:] = 0
+
+
+@pytest.mark.parametrize("flaw", [with_swapped_candidates, with_unseen_candidates])
+def test_a_graph_that_takes_the_candidates_for_others_is_not_written(flaw, tmp_path, monkeypatch):
+    """The check's own candidates are far from each other, so that such a mistake is no matter of rounding."""
+    wrong, real, out = random_content("stereokit"), module.onnx_model, tmp_path / "m.onnx"
+    flaw(wrong)
+    assert module.largest_difference(random_content("stereokit"), real(wrong)) > 50 * module.TOLERANCE_PX
+    monkeypatch.setattr(module, "onnx_model", lambda content: real(wrong))
+    failed(run("-o", out, "--refiner", weight_file(tmp_path, "stereokit")), "differs from the refiner by")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_graphs_ask_for_what_their_network_looks_at(name):
+    import onnx
+
+    channels = {"coarse": 1, "left": 1, "confidence": 1, "candidates": 2}
+    for evidence in {"confidence", "candidates"} - NETWORKS[name].inputs.keys():
+        del channels[evidence]
+    graph = onnx.load_from_string(module.onnx_model(random_content(name))).graph
+    sizes = {i.name: [d.dim_value or d.dim_param for d in i.type.tensor_type.shape.dim] for i in graph.input}
+    large = {"left": ["2h", "2w"]}
+    assert sizes == {key: [1, count, *large.get(key, ["h", "w"])] for key, count in channels.items()}
+
+
 def test_a_graph_that_computes_nan_is_not_written(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "largest_difference", lambda content, model: float("nan"))
     out = tmp_path / "m.onnx"

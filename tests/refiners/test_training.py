@@ -210,6 +210,8 @@ def test_batches_are_functions_of_seed_step_and_rank():
         "candidates": (2, 2, 8, 16), "values": (2, 2, 8, 16), "coarse": (2, 1, 8, 16),
         "truth": (2, 1, 16, 32), "weight": (2, 1, 16, 32),
     }  # fmt: skip
+    for shown, pixels in (("candidates", "values"), ("disparity", "coarse")):  # of one map, in one order
+        np.testing.assert_allclose(first[shown], first[pixels] / 16 - 1.5, atol=1e-5)
     for name, tensor in draw(5).items():
         assert torch.equal(tensor, first[name])
     for other in (draw(6), draw(5, rank=1), draw(5, seed=4)):

@@ -78,7 +78,7 @@ class Matcher:
         `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
     device : {"auto", "cpu", "cuda"}
         Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``; "auto" takes it
-        where it can be used, else the CPU. Refiners run on the CPU.
+        where it can be used, else the CPU. Refiners run on the CPU, but for `on_device`.
     threads : int or None
         Threads of one call; None uses the processors at hand. The result does not depend on it.
     fill : {"background", "nearest"} or None
@@ -255,7 +255,7 @@ class Matcher:
         Disparity
             Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, if asked for,
             ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
-            a filled map is `min_disparity` everywhere.
+            a filled map is `min_disparity` everywhere; learned refiners may add a pixel or two.
 
         Raises
         ------

@@ -38,7 +38,8 @@ class Disparity:
         The map of the right view, pixels, NaN where invalid.
     candidates : (2, H, W) float32, optional
         Disparities that the aggregated costs alone are in favour of, pixels: the best, before any check, filter or
-        fill, and the best of those that are not next to it. Refiners that ask for them get them.
+        fill, and the best of those that are not next to it, or the best again where there is none. Refiners that ask
+        for them get them.
 
     Raises
     ------

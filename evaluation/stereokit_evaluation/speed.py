@@ -39,6 +39,7 @@ from stereokit_evaluation.pipeline import PipelineRow, print_pipeline, time_pipe
 from stereokit_evaluation.pipeline import as_json as pipeline_json
 from stereokit_evaluation.published import PAPER
 from stereokit_evaluation.scenes import generate
+from stereokit_refiners.weights import NETWORKS
 
 __all__ = ["bench"]
 
@@ -168,6 +169,8 @@ def _check_tables(model: bool, device: str, pipeline: bool, stages: bool, scale:
         raise OptionError(f"scale must come with model or device cuda, got {scale:g} alone; see also pipeline")
     if runtimes is not None and not pipeline:
         raise OptionError(f"runtimes must come with pipeline, got {runtimes!r} alone")
+    if runtimes is not None and runtimes not in NETWORKS:
+        raise OptionError(f"runtimes must be one of {', '.join(NETWORKS)}, got {runtimes!r}")
 
 
 def _pipeline(

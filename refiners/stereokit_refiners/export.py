@@ -2,8 +2,8 @@
 
 The exported graph is the whole refiner, with scaling and upsampling inside:
 
-- ``coarse``, (1, 1, h, w) float32: half-size map in half-size pixels, without gaps; h and w multiples of the
-  network's own (4 or 8);
+- ``coarse``, (1, 1, h, w) float32: half-size map in half-size pixels, without gaps, from 0 on (lift a range that begins
+  below to 0, and lower the result by twice as much); h and w multiples of the network's own (4 or 8);
 - ``left``, (1, 1, 2h, 2w) float32: grey levels 0 to 255;
 - ``confidence``, (1, 1, h, w) float32, 0 to 1, 0 where not measured, for networks that look at it;
 - ``candidates``, (1, 2, h, w) float32, the matcher's, half-size pixels, for networks that look at them;

@@ -135,7 +135,8 @@ class LearnedRefiner:
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the refined map at the size of `left`; see `stereokit_refiners.refiner.Refiner`.
 
-        Where the coarse map is NaN, the result is; the network sees it filled.
+        Where the coarse map is NaN, the result is; the network sees it filled. Networks know disparities from 0 on:
+        one whose map goes below sees it lifted by as much.
         """
         network = network_named(self._file.network)
         rows, columns = left.shape
@@ -148,13 +149,17 @@ class LearnedRefiner:
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
         below, beside = -height % network.multiple, -width % network.multiple
-        disparity = _extended(disparity * np.float32(2), below, beside)
+        candidates = coarse.candidates if self.needs_candidates else None
+        shift = np.float32(min(0.0, *(np.floor(a.min()) for a in (disparity, candidates) if a is not None)))
+        disparity = _extended((disparity - shift) * np.float32(2), below, beside)
         confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
         image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
-        two = None if coarse.candidates is None else _extended_each(coarse.candidates * np.float32(2), below, beside)
+        two = None if candidates is None else _extended_each((candidates - shift) * np.float32(2), below, beside)
         inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
         head = self._compiled.run(inputs, threads)
         full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
+        if shift < 0:
+            full += 2 * shift
         known = _doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
         if gaps:
             missing = _doubled(unknown.view(np.uint8), rows, columns).astype(bool)

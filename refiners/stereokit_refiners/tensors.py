@@ -102,13 +102,17 @@ class TensorRefiner:
         height, width = disparity.shape
         below, beside = -height % self.network.multiple, -width % self.network.multiple
         with torch.inference_mode():
-            disparity = _extended(disparity.float() * 2, below, beside)
+            lowest = (
+                torch.minimum(disparity.min(), two.min()) if "candidates" in self.network.inputs else disparity.min()
+            )
+            shift = lowest.float().floor().clamp(max=0)  # as in LearnedRefiner; the host never sees it
+            disparity = _extended((disparity.float() - shift) * 2, below, beside)
             known = _extended(known.float(), below, beside)
-            two = _extended(two.float() * 2, below, beside)
+            two = _extended((two.float() - shift) * 2, below, beside)
             gray = _extended(image.float(), 2 * (height + below) - rows, 2 * (width + beside) - columns)
             heads = self._module(self._encoded(disparity, known, two, gray))
             full = compose(self.network.name, self.content.form, heads["map"], disparity, two)
-            return full[0, 0, :rows, :columns].contiguous()
+            return (full[0, 0, :rows, :columns] + 2 * shift).contiguous()
 
     def _encoded(self, disparity: Tensor, confidence: Tensor, two: Tensor, left: Tensor) -> dict[str, Tensor]:
         """Return the network's inputs: `stereokit_refiners.encode.encode` in torch."""

@@ -158,13 +158,6 @@ def _check(
     network = network_named(name)
     if form not in network.forms:
         raise FileError(f"form of {name!r} must be one of {', '.join(network.forms)}, got {form!r} in {path!r}")
-    channels = activations(network)
-    for key, bounds in ranges.items():
-        if key not in channels:
-            raise FileError(f"ranges must be of activations of {name!r}, got {key!r} in {path!r}")
-        if len(bounds) != channels[key] or not all(math.isfinite(b) and b >= 0 for b in bounds):
-            rule = f"{channels[key]} finite numbers of at least 0"
-            raise FileError(f"range of {key!r} must be {rule}, got {bounds} in {path!r}")
     wanted = shapes(network)
     missing, unknown = sorted(set(wanted) - set(arrays)), sorted(set(arrays) - set(wanted))
     if missing or unknown:
@@ -173,6 +166,14 @@ def _check(
     for key, shape in wanted.items():
         if arrays[key].shape != shape or arrays[key].dtype != np.float32:
             found = f"{arrays[key].dtype} {arrays[key].shape}"
-            raise FileError(f"weights must hold {key!r} as float32 {shape}, got {found} in {path!r}")
+            rule = f"weights must hold {key!r} as float32 {shape} in this version of {name!r}"
+            raise FileError(f"{rule}, got {found} in {path!r}")
         if not np.isfinite(arrays[key]).all():
             raise FileError(f"weights must be finite, but {key!r} in {path!r} is not")
+    channels = activations(network)
+    for key, bounds in ranges.items():
+        if key not in channels:
+            raise FileError(f"ranges must be of activations of {name!r}, got {key!r} in {path!r}")
+        if len(bounds) != channels[key] or not all(math.isfinite(b) and b >= 0 for b in bounds):
+            rule = f"{channels[key]} finite numbers of at least 0"
+            raise FileError(f"range of {key!r} must be {rule}, got {len(bounds)}: {bounds} in {path!r}")

@@ -51,7 +51,7 @@ def require_device() -> None:
     reason = missing()
     if reason:
         raise DeviceError(
-            f"device must be 'cpu' or 'auto' here, got 'cuda': {reason}; it needs an NVIDIA GPU, its driver and "
+            f"device 'cuda' cannot be used here: {reason}; it needs an NVIDIA GPU, its driver and "
             "pip install 'stereokit[cuda]'"
         )
 

@@ -86,4 +86,6 @@ def main(write: bool) -> None:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:] not in ([], ["--write"]):
+        sys.exit("usage: python -m ptx.budgets [--write]")
     main("--write" in sys.argv[1:])

@@ -303,4 +303,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:]:
+        sys.exit("usage: python -m ptx.mutants")
     sys.exit(main() > 0)

@@ -102,6 +102,17 @@ def test_confidence_and_candidates_decide_where_they_are_looked_at_and_nowhere_e
     assert moved.any() == getattr(exact, f"needs_{what}")
 
 
+@pytest.mark.parametrize("down", [1, 40])
+def test_disparities_below_zero_are_refined_like_those_above(exact, down):
+    coarse, left = coarse_of((33, 47), gaps=0.1, low=0.2), image_of((33, 47))
+    above = dataclasses.replace(coarse, disparity=coarse.disparity.copy(), candidates=np.abs(coarse.candidates))
+    above.disparity[0, 0] = above.candidates[0, 0, 0] = 0  # so that both have the same lowest level
+    below = dataclasses.replace(above, disparity=above.disparity - np.float32(down), candidates=above.candidates - down)
+    found, expected = exact(below, left), exact(above, left)
+    np.testing.assert_allclose(found.disparity, expected.disparity - 2 * down, rtol=0, atol=2e-3)
+    np.testing.assert_array_equal(found.valid, expected.valid)
+
+
 @pytest.mark.parametrize("size", [(33, 47), (1, 9)])
 def test_the_same_call_gives_the_same_bits_with_any_threads(refiner, size):
     coarse, left = coarse_of(size, gaps=0.1), image_of(size)

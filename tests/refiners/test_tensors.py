@@ -49,6 +49,14 @@ def test_tensors_give_what_arrays_give(name, form, size, device):
     assert torch.equal(again, found)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_tensors_below_zero_give_what_arrays_give(name):
+    content, coarse, left = random_content(name), coarse_of((33, 47), low=-40, high=-5), image_of((33, 47))
+    expected = LearnedRefiner.of(content, backend="torch")(coarse, left).disparity
+    found = TensorRefiner(content, "cpu")(coarse.disparity, coarse.confidence, left, coarse.candidates)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=TOLERANCE_PX)
+
+
 def test_only_networks_that_look_at_the_confidence_and_candidates_need_them():
     coarse, left = coarse_of((16, 24)), image_of((16, 24))
     for name in ("cnn", "stereovae"):

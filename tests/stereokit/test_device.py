@@ -68,7 +68,7 @@ def test_cuda_without_a_driver_says_what_to_do(no_driver):
         Matcher("S2", device="cuda")
     message = str(caught.value)
     assert message == (
-        "device must be 'cpu' or 'auto' here, got 'cuda': no NVIDIA driver is installed; "
+        "device 'cuda' cannot be used here: no NVIDIA driver is installed; "
         "it needs an NVIDIA GPU, its driver and pip install 'stereokit[cuda]'"
     )
     assert isinstance(caught.value, OptionError) and isinstance(caught.value, StereokitError)

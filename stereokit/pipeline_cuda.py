@@ -225,6 +225,8 @@ class CudaPipeline:
         stream = cuda.default_stream() if stream is None else stream_of(stream)
         with self._queue(stream) as queue:
             found = self._match_views(queue, views, False, stream)
+            if not self._settings.half:  # what refiners return is new
+                found = _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
             other = None
             if self._settings.right:
                 mirrored = _flat(self._match_views(queue, views[::-1], True, stream).disparity)
@@ -234,7 +236,7 @@ class CudaPipeline:
         return DeviceDisparity(*found[:3], other)
 
     def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _Found:
-        """Match two images on the device, or what a camera behind a mirror sees of them; the maps are the caller's."""
+        """Match two images on the device, or what a camera behind a mirror sees of them; at half size, refine."""
         shape, dtype = views[0].shape, views[0].dtype
         pixels = shape[0] * shape[1]
         images = queue.array("images", 2 * pixels, dtype)
@@ -246,7 +248,7 @@ class CudaPipeline:
             two = None if found.candidates is None else _reshaped(found.candidates, (2, *size))
             coarse = DeviceDisparity(disparity, valid, sure, candidates=two)
             return _Found(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
-        return _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
+        return found
 
     @contextmanager
     def _queue(self, stream: Any) -> Iterator[Any]:

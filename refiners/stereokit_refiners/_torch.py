@@ -133,9 +133,7 @@ def _sub_pixel(weight: Tensor) -> Tensor:
     return kernel.reshape(4 * outputs, inputs, 3, 3)
 
 
-def compose(
-    name: str, form: str, head: Tensor, coarse: Tensor, candidates: Tensor | None = None
-) -> Tensor:  # fmt: skip
+def compose(name: str, form: str, head: Tensor, coarse: Tensor, candidates: Tensor | None = None) -> Tensor:
     """Return the full-size map of a network's head; the twin of `stereokit_refiners._compose.compose`.
 
     Parameters

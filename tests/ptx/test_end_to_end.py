@@ -142,7 +142,7 @@ def host_as_device(queues, monkeypatch):
         return pipeline_cuda._Image(np.ascontiguousarray(image).ravel(), image.dtype, channels, image.shape[:2])
 
     def flat(held: Any) -> Buffer:
-        values = np.asarray(held).ravel()
+        values = held.values if isinstance(held, Buffer) else np.asarray(held).ravel()
         out = Buffer(values.size, values.dtype)
         out.values[:], out.known[:] = values, 1
         return out

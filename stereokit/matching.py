@@ -11,7 +11,6 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +32,7 @@ from stereokit.images.gray import (
     half_size,
     smooth,
 )
-from stereokit.kernels.threads import available_threads, crew
+from stereokit.kernels.threads import Job, Workers, available_threads, team
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.methods import check_levels, find_refiner, option_names, parse_method
 from stereokit.postprocess.chain import Chain, post_process
@@ -138,7 +137,7 @@ class Matcher:
         self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
         self._asks = bool(getattr(self._refine, "needs_candidates", False))
         self._confident = self.confidence or self._asks or bool(getattr(self._refine, "needs_confidence", False))
-        self._pool = Pool()
+        self._pool = Pool(Workspace)
         self.device = "cpu"
         self._cuda: CudaPipeline | None = None
         if device == "cuda" or (device == "auto" and has_device()):
@@ -204,7 +203,7 @@ class Matcher:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._pool = Pool()
+        self._pool = Pool(Workspace)
         self._cuda = None
         if self.device == "cuda":
             require_device()
@@ -289,34 +288,38 @@ class Matcher:
         InputError
             When the turn comes of a pair that cannot be used.
         """
-        ahead: deque[Future[Disparity]] = deque()
+        ahead: deque[Job[Disparity]] = deque()
         source = iter(pairs)
-        workers = self.threads if self._cuda is None else min(2, self.threads)  # each has buffers on the device
-        with ThreadPoolExecutor(workers, thread_name_prefix="stereokit-map") as executor:
-            try:
-                failure: BaseException | None = None  # of the source: what it gave before is still matched
-                for done in itertools.count(1):
-                    while failure is None and len(ahead) < 2 * self.threads:
-                        try:
-                            pair = next(source)
-                            left, right = pair
-                        except (TypeError, ValueError):
-                            failure = InputError("pairs must give (left, right) each time")
-                        except BaseException as error:
-                            failure = error
-                        else:
-                            ahead.append(executor.submit(self._call, left, right, 1))
-                    if not ahead:
-                        if isinstance(failure, StopIteration):
-                            return
-                        assert failure is not None
-                        raise failure
-                    yield ahead.popleft().result()
-                    if progress is not None:
-                        progress(done)
-            finally:
-                for waiting in ahead:
-                    waiting.cancel()
+        # On a GPU each has buffers there.
+        workers = Workers(self.threads if self._cuda is None else min(2, self.threads))
+        try:
+            failure: Exception | None = None  # of the source: what it gave before is still matched
+            for done in itertools.count(1):
+                while failure is None and len(ahead) < 2 * self.threads:
+                    try:
+                        pair = next(source)
+                        left, right = pair
+                    except (TypeError, ValueError):
+                        failure = InputError("pairs must give (left, right) each time")
+                    except Exception as error:
+                        failure = error
+                    else:
+                        ahead.append(Job(self._call, left, right, 1))
+                        workers.submit(ahead[-1])
+                if not ahead:
+                    if isinstance(failure, StopIteration):
+                        return
+                    assert failure is not None
+                    raise failure
+                result = ahead[0].result()
+                ahead.popleft()
+                yield result
+                if progress is not None:
+                    progress(done)
+        finally:
+            for job in ahead:
+                job.withdraw()
+            workers.close()
 
     def _call(self, left: Any, right: Any, threads: int) -> Disparity:
         pair = gray_pair(left, right)
@@ -333,15 +336,15 @@ class Matcher:
         if self._cuda is not None:
             found = self._cuda.host(pair)
         else:
-            with crew(threads):
+            with team(threads):
                 same = self._refine is None
-                found = self._match_with_crew(pair if same else half_size(pair), self._levels(), workspace, threads)
+                found = self._match_on_cpu(pair if same else half_size(pair), self._levels(), workspace, threads)
         if self._refine is None:
             return found
         refined = self._refine(found, pair.guide, threads=threads)
         return refined if self.confidence else Disparity(refined.disparity, refined.valid)
 
-    def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
+    def _match_on_cpu(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
         low = levels.minimum
         pair = smooth(pair, self.smooth, workspace, threads)
         shape = pair.left.shape

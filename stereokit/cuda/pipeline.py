@@ -8,7 +8,6 @@ are running gets a queue, with buffers, of its own.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from stereokit.cuda.stream import DeviceQueue, stream_of
 from stereokit.errors import DeviceError, InputError
 from stereokit.images.gray import GrayPair
 from stereokit.images.prepare_cuda import flip, halve, smooth, take
+from stereokit.kernels.workspace import Pool
 from stereokit.postprocess.chain import Chain
 from stereokit.postprocess.chain_cuda import post_process
 from stereokit.result import Disparity
@@ -164,7 +164,7 @@ class CudaPipeline:
             zncc_cuda.check_window(cost)
         self._settings = settings
         self._refine = refine
-        self._free: dict[Any, deque[Any]] = {}
+        self._queues: dict[int | None, Pool[Any]] = {}
 
     def host(self, pair: GrayPair) -> Disparity:
         """Match a checked pair of the host.
@@ -253,15 +253,9 @@ class CudaPipeline:
     @contextmanager
     def _queue(self, stream: Any) -> Iterator[Any]:
         """Lend a queue on `stream`; None is a stream of the queue's own."""
-        free = self._free.setdefault(None if stream is None else int(stream), deque())
-        try:
-            queue = free.pop()
-        except IndexError:
-            queue = new_queue(stream)
-        try:
+        key = None if stream is None else int(stream)
+        with self._queues.setdefault(key, Pool(lambda: new_queue(stream))).take() as queue:
             yield queue
-        finally:
-            free.append(queue)
 
     def run(
         self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,

@@ -54,11 +54,11 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
 
 def median_rows(
     source: NDArray[np.float32], size: int, y0: int, y1: int, out: NDArray[np.float32],
-    workspace: Workspace | None = None, dense: bool = False,
+    workspace: Workspace | None = None, dense: bool = False, band: int = 0,
 ) -> None:  # fmt: skip
     """Write rows y0..y1 of the filtered map to `out`; the same values however the rows are cut into ranges.
 
-    `dense` promises that no pixel is NaN.
+    `dense` promises that no pixel is NaN; `band` is another number for each range that is filtered at the same time.
     """
     half = size // 2
     top, bottom = max(y0 - half, 0), min(y1 + half, source.shape[0])
@@ -77,9 +77,9 @@ def median_rows(
     elif top == y0 and bottom == y1:
         cv2.medianBlur(part, size, dst=out[y0:y1])
     else:
-        held = np.empty_like(part) if workspace is None else workspace.array(f"median.{y0}", part.shape, np.float32)
-        cv2.medianBlur(part, size, dst=held)
-        out[y0:y1] = held[y0 - top : y1 - top]
+        wide = np.empty_like(part) if workspace is None else workspace.array(f"median.{band}", part.shape, np.float32)
+        cv2.medianBlur(part, size, dst=wide)
+        out[y0:y1] = wide[y0 - top : y1 - top]
 
 
 @lru_cache(maxsize=2)

@@ -105,8 +105,8 @@ def aggregate(
     floats = volume.dtype == np.float32
     if volume.ndim != 3 or 0 in volume.shape or not (volume.dtype == np.uint8 or floats):
         raise InputError(f"volume must be (H, W, D) uint8 or float32, got {volume.dtype} {volume.shape}")
-    if floats and stage.name != "dt":
-        raise InputError("volume must be uint8 for aggregation 'sgm', got float32")
+    if floats and not getattr(stage, "accepts_floats", False):
+        raise InputError(f"volume must be uint8 for aggregation {stage.name!r}, got float32")
     guide = writable(guide)
     if guide.dtype != np.uint8 or guide.shape != volume.shape[:2]:
         raise InputError(f"guide must be uint8 {volume.shape[:2]}, got {guide.dtype} {guide.shape}")

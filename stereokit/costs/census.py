@@ -57,6 +57,7 @@ class Census:
 
     window: str = "9x7"
     name: ClassVar[str] = "census"
+    cuda: ClassVar[str] = "stereokit.costs.census_cuda"
 
     def __post_init__(self) -> None:
         if not isinstance(self.window, str) or self.window not in WINDOWS:

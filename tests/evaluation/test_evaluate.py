@@ -355,9 +355,9 @@ def test_frames_that_a_refiner_was_trained_on_are_told_of():
 
     frames = [Frame(name, Path("l"), Path("r")) for name in ("a", "b", "c")]
     refiner = SimpleNamespace(trained_on=frozenset({"set/a", "set/c", "other/b"}))
-    matcher = SimpleNamespace(refiner="mine", _refine=refiner)
+    matcher = SimpleNamespace(refiner="mine", refine=refiner)
     line = seen_in_training(matcher, "set", frames)
     assert line is not None and "'mine' was trained on 2 of these 3 frames" in line
     assert seen_in_training(matcher, "elsewhere", frames) is None
-    assert seen_in_training(SimpleNamespace(_refine=None), "set", frames) is None
+    assert seen_in_training(SimpleNamespace(refine=None), "set", frames) is None
     assert seen_in_training(object(), "set", frames) is None

@@ -92,7 +92,7 @@ def match_large(
     left: Any,
     right: Any,
     output: str | os.PathLike[str],
-    method: str = "zncc+sgm",
+    method: str = "census+sgm",
     *,
     memory: int | float | str | None = None,
     overlap: int = OVERLAP,

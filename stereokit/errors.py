@@ -17,6 +17,7 @@ __all__ = [
     "StereokitError",
     "UnknownNameError",
     "did_you_mean",
+    "shown",
 ]
 
 
@@ -44,6 +45,15 @@ class FileError(StereokitError):
     """A file is missing, cannot be read as what it should be, or cannot be written."""
 
 
+def shown(value: object) -> str:
+    """Return a value as a message shows it: on one line, and not long."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # such as integers of thousands of digits
+        text = f"a value of type {type(value).__name__}"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
 def did_you_mean(kind: str, name: str, known: Iterable[str]) -> str:
     """Return the line that says that no `kind` is called `name`, with the nearest known name.
 
@@ -59,4 +69,4 @@ def did_you_mean(kind: str, name: str, known: Iterable[str]) -> str:
     names = sorted(known)
     close = difflib.get_close_matches(name.lower(), names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else "."
-    return f"no {kind} named {name!r}{hint} Known: {', '.join(names) or 'none'}"
+    return f"no {kind} named {shown(name)}{hint} Known: {', '.join(names) or 'none'}"

@@ -17,6 +17,7 @@ from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume
 from stereokit.errors import InputError, OptionError
 from stereokit.images.gray import check_integer, check_number, gray_pair, writable
 from stereokit.images.gray import smooth as smoothed
+from stereokit.images.maps import numbers
 from stereokit.kernels.threads import available_threads
 from stereokit.kernels.workspace import Workspace
 from stereokit.methods import build_aggregation, build_cost, check_levels
@@ -101,13 +102,15 @@ def aggregate(
     """
     stage = build_aggregation(aggregation, options)
     maker: Cost = build_cost(cost, {})
-    volume = np.asarray(volume)
+    volume = numbers("volume", volume)
     floats = volume.dtype == np.float32
     if volume.ndim != 3 or 0 in volume.shape or not (volume.dtype == np.uint8 or floats):
         raise InputError(f"volume must be (H, W, D) uint8 or float32, got {volume.dtype} {volume.shape}")
-    if floats and stage.name != "dt":
-        raise InputError("volume must be uint8 for aggregation 'sgm', got float32")
-    guide = writable(guide)
+    if floats and not getattr(stage, "accepts_floats", False):
+        raise InputError(f"volume must be uint8 for aggregation {stage.name!r}, got float32")
+    if floats and not np.isfinite(volume).all():
+        raise InputError("volume must be finite, got NaN or infinity")
+    guide = writable(numbers("guide", guide))
     if guide.dtype != np.uint8 or guide.shape != volume.shape[:2]:
         raise InputError(f"guide must be uint8 {volume.shape[:2]}, got {guide.dtype} {guide.shape}")
     count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)

@@ -35,7 +35,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, cost_row
-from stereokit.errors import OptionError
+from stereokit.errors import OptionError, shown
 from stereokit.images.gray import check_integer, check_number
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.simd import (
@@ -53,6 +53,7 @@ from stereokit.kernels.simd import (
     subtract,
 )
 from stereokit.kernels.threads import run, spans
+from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, keys_of, select_pixel
@@ -100,10 +101,12 @@ class Dt:
     passes: int = 1
     mode: str = "rf"
     name: ClassVar[str] = "dt"
+    accepts_floats: ClassVar[bool] = True
+    cuda: ClassVar[str] = "stereokit.aggregation.dt_cuda"
 
     def __post_init__(self) -> None:
-        if self.mode not in ("rf", "sum"):
-            raise OptionError(f"mode of dt must be 'rf' or 'sum', got {self.mode!r}")
+        if not isinstance(self.mode, str) or self.mode not in ("rf", "sum"):
+            raise OptionError(f"mode of dt must be 'rf' or 'sum', got {shown(self.mode)}")
         for name in ("sigma_s", "sigma_v", "sigma_r"):
             value = getattr(self, name)
             if value is not None or name != "sigma_v":
@@ -170,15 +173,18 @@ class Dt:
             row = workspace.array(f"dt.row{k}", width * padded, dtype)
             if first and volume is None:
                 fresh = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
-                _produce_rows(rows[k], blocks, guide, weights, y0, y1, fresh, row, costs)
+                with span("match", "sweep: rows with costs"):
+                    _produce_rows(rows[k], blocks, guide, weights, y0, y1, fresh, row, costs)
             else:
-                _filter_rows(blocks, guide, weights, y0, y1, row, costs)
+                with span("match", "sweep: rows"):
+                    _filter_rows(blocks, guide, weights, y0, y1, row, costs)
 
         def filter_bands(k: int, weights: Weights, last: bool) -> None:
             column = workspace.array(f"dt.band{k}", height * band * padded, dtype)
             state = workspace.array(f"dt.state{k}", band * padded, dtype)
             for x0, x1 in shares[k]:
-                _filter_band(blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep)
+                with span("match", "sweep: columns"):
+                    _filter_band(blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep)
 
         for number, weights in enumerate(passes):
             last = number == len(passes) - 1

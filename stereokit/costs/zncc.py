@@ -96,6 +96,9 @@ class Zncc:
     window: int = 5
     steps: int = 31
     name: ClassVar[str] = "zncc"
+    cuda: ClassVar[str] = "stereokit.costs.zncc_cuda"
+    needs_ranges: ClassVar[bool] = True
+    bytes_per_pixel: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
         window = check_integer("window", self.window, 3, 127)

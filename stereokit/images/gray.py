@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, OptionError, did_you_mean
+from stereokit.errors import InputError, OptionError, did_you_mean, shown
 from stereokit.kernels.threads import run
 from stereokit.kernels.workspace import Workspace
 
@@ -71,25 +71,25 @@ class GrayPair:
 def check_integer(name: str, value: Any, low: int | None = None, high: int | None = None) -> int:
     """Return `value` as an int if it is a whole number from `low` to `high`, else raise OptionError."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        raise OptionError(f"{name} must be an integer, got {value!r}")
+        raise OptionError(f"{name} must be an integer, got {shown(value)}")
     if (low is not None and value < low) or (high is not None and value > high):
         rule = f"at least {low}" if high is None else f"from {low} to {high}"
-        raise OptionError(f"{name} must be {rule}, got {value}")
+        raise OptionError(f"{name} must be {rule}, got {shown(value)}")
     return int(value)
 
 
 def check_number(name: str, value: Any, low: float, high: float) -> float:
     """Return `value` as a float if it lies from `low` to `high`, else raise OptionError."""
-    wrong = isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.number))
+    wrong = isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating))
     if wrong or not low <= value <= high:
-        raise OptionError(f"{name} must be a number from {low:g} to {high:g}, got {value!r}")
+        raise OptionError(f"{name} must be a number from {low:g} to {high:g}, got {shown(value)}")
     return float(value)
 
 
 def check_flag(name: str, value: Any) -> bool:
     """Return `value` if it is True or False, else raise OptionError."""
     if not isinstance(value, (bool, np.bool_)):
-        raise OptionError(f"{name} must be True or False, got {value!r}")
+        raise OptionError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
 
 
@@ -114,8 +114,8 @@ def checked_image(name: str, image: Any) -> NDArray[Any]:
         raise InputError(f"{name} must lie in host memory here, got an array on a GPU; see Matcher.on_device")
     try:
         array = np.asarray(image)
-    except ValueError as error:
-        raise InputError(f"{name} must be an array of numbers: {error}") from None
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be an array of numbers, got {shown(image)}") from None
     if array.dtype.byteorder not in "=|":
         array = array.astype(array.dtype.newbyteorder("="))
     if array.dtype not in _TYPES:

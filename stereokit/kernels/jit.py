@@ -6,10 +6,10 @@ exception inside loops). There is no ``fastmath``: results must not depend on th
 ``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.threads` runs
 several of them at once, which is safe from any number of calling threads and compiles in half the time.
 
-What is compiled is kept where numba keeps it: in the folder that ``NUMBA_CACHE_DIR`` names, beside the source, or in the
-user's cache. Where none of these can be written, as in a read-only container, it goes to a folder of temporary files
-that is the user's alone, and where that cannot be either, it is compiled again in every process. A file of the cache
-that is damaged (a full disk, a power cut) counts as absent, and is written again.
+What is compiled is kept where numba keeps it: in the folder that ``NUMBA_CACHE_DIR`` names, beside the source, or in
+the user's cache. Where none of these can be written, as in a read-only container, it goes to a folder of temporary
+files that is the user's alone, and where that cannot be either, it is compiled again in every process. A file of the
+cache that is damaged (a full disk, a power cut) counts as absent, and is written again.
 
 Numba files a compiled kernel under the name of its function and looks only at the file which that stands in, not
 at the functions that are compiled into it. So each name carries a fingerprint of the whole package's source: after
@@ -123,7 +123,7 @@ class _TemporaryLocator:
 
 
 class _CheckedFiles(CompileResultCacheImpl):  # type: ignore[misc]
-    """Numba's way of keeping compiled functions, with a digest: a damaged one could crash, or compute something else."""
+    """Numba's way of keeping compiled functions, with a digest: a damaged one might crash or compute something else."""
 
     _locator_classes = (*CompileResultCacheImpl._locator_classes, _TemporaryLocator)
 

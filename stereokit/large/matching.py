@@ -16,18 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stereokit.costs import Zncc
 from stereokit.errors import InputError, OptionError
-from stereokit.images.gray import GrayPair, check_integer
-from stereokit.kernels.workspace import Workspace
+from stereokit.images.gray import check_integer
 from stereokit.large.bands import Bands
-from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes, window_model
+from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes
 from stereokit.large.output import check_large_output, write_bands
 from stereokit.large.plan import Plan, plan
 from stereokit.large.sources import Source, open_source
 from stereokit.large.tones import BLOCK_NBYTES, Ranges, Tone, find_ranges, find_tone
 from stereokit.matching import Matcher
-from stereokit.result import Disparity
 
 __all__ = ["OVERLAP", "LargeResult", "match_large"]
 
@@ -95,7 +92,7 @@ def match_large(
     left: Any,
     right: Any,
     output: str | os.PathLike[str],
-    method: str = "zncc+sgm",
+    method: str = "census+sgm",
     *,
     memory: int | float | str | None = None,
     overlap: int = OVERLAP,
@@ -147,8 +144,8 @@ def match_large(
     height, width = sources[0].shape[:2]
     windows = _plan(matcher, sources, tone, overlap, limit, target)
     ranges: Ranges | None = None
-    if isinstance(matcher.cost, Zncc):  # its grey levels depend on the range of the whole image
-        ranges = find_ranges(*sources, tone, matcher.scale != 1, matcher.smooth, matcher.threads)
+    if getattr(matcher.cost, "needs_ranges", False):
+        ranges = find_ranges(*sources, tone, matcher.scale != 1, matcher.settings.smooth, matcher.threads)
     bands = Bands(matcher, sources, tone, ranges, windows, progress)
     write_bands(target, height, width, bands)
     total = len(windows.rows) * len(windows.columns)
@@ -166,19 +163,15 @@ def _check_pair(left: Source, right: Source) -> None:
 def _plan(
     matcher: Matcher, sources: tuple[Source, Source], tone: Tone, overlap: int, limit: int | None, target: Path
 ) -> Plan:
-    def match(pair: GrayPair, workspace: Workspace) -> Disparity:
-        return matcher.match_gray(pair, workspace, matcher.threads)
-
-    buffers = window_model(match, tone.kind)
     height, width = sources[0].shape[:2]
     size = tone.kind.itemsize
     pixel = 2 * size + (size > 1) + 2 * (sources[0].dtype.kind == "f") + 5  # both images, guide, masks, the map
-    pixel += 4 * isinstance(matcher.cost, Zncc)  # the images once more
+    pixel += getattr(matcher.cost, "bytes_per_pixel", 0)
     pixel += _refiner_nbytes(matcher)
     band = 4 * width * (2 if target.suffix.lower() == ".npy" else 4)  # before and after the median, and as tiles
 
     def needed(rows: int, columns: int) -> float:
-        return buffers(rows, columns) + pixel * rows * columns + band * rows
+        return matcher.nbytes(rows, columns, tone.kind) + pixel * rows * columns + band * rows
 
     used = resident_nbytes()
     limit = used + free_nbytes() // 2 if limit is None else limit

@@ -14,7 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, OptionError
+from stereokit.errors import OptionError, shown
+from stereokit.images.gray import check_integer
+from stereokit.images.maps import checked_map
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, load, maximum, minimum, store
 from stereokit.kernels.workspace import Workspace
@@ -40,13 +42,11 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
     OptionError
         If the size is another.
     InputError
-        If the map is not two-dimensional.
+        If the map is not (H, W) numbers.
     """
-    if size not in (3, 5):
-        raise OptionError(f"size of the median must be 3 or 5, got {size!r}")
-    if disparity.ndim != 2:
-        raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
-    source = np.ascontiguousarray(disparity, np.float32)
+    if check_integer("size of the median", size) not in (3, 5):
+        raise OptionError(f"size of the median must be 3 or 5, got {shown(size)}")
+    source = checked_map(disparity)
     out = np.empty_like(source)
     median_rows(source, size, 0, source.shape[0], out)
     return out

@@ -64,7 +64,7 @@ def test_an_interrupt_at_each_submit_and_each_allocation(method, threads, place,
     expected = matcher(*pair).disparity
 
     def call():
-        matcher._pool = workspace.Pool(workspace.Workspace)  # allocates all buffers
+        matcher._pipeline._workspaces = workspace.Pool(workspace.Workspace)  # allocates all buffers
         matcher(*pair)
 
     for _ in interrupted_everywhere(call, monkeypatch, *place):
@@ -79,7 +79,7 @@ def test_an_interrupt_of_map_at_each_submit_and_each_allocation(threads, place, 
     expected = [matcher(*pair).disparity for pair in pairs]
 
     def call():
-        matcher._pool = workspace.Pool(workspace.Workspace)
+        matcher._pipeline._workspaces = workspace.Pool(workspace.Workspace)
         list(matcher.map(pairs))
 
     for _ in interrupted_everywhere(call, monkeypatch, *place):
@@ -198,7 +198,7 @@ def test_workers_end_when_they_have_had_nothing_to_do_for_a_while(monkeypatch):
 
 
 def nbytes(matcher):
-    return sum(free.nbytes for free in matcher._pool.free)
+    return sum(free.nbytes for free in matcher._pipeline._workspaces.free)
 
 
 def test_the_buffers_of_a_burst_are_given_back():
@@ -209,9 +209,9 @@ def test_the_buffers_of_a_burst_are_given_back():
     together = threading.Barrier(12)
 
     def call():
-        with matcher._pool.take() as buffers:
+        with matcher._pipeline._workspaces.take() as buffers:
             together.wait(60)  # all at the same time
-            matcher.match_gray(stereokit.images.gray.gray_pair(*large), buffers, 1)
+            matcher._pipeline._coarse(stereokit.images.gray.gray_pair(*large), buffers, 1)
 
     burst = [threading.Thread(target=call) for _ in range(12)]
     for thread in burst:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import stereokit
-from stereokit.cli.app import app
+from stereokit.cli import app
 from stereokit.errors import FileError, InputError, OptionError, StereokitError
 from stereokit.large import matching, memory
 from stereokit.large.output import write_bands

@@ -54,7 +54,7 @@ _SHOWN_ERRORS = 10
 def batch(
     inputs: Annotated[list[Path], typer.Argument(help="A folder, a list or a video; or two folders or two videos.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the maps, NAME.FORMAT.")],
-    method: MethodOption = "zncc+sgm",
+    method: MethodOption = "census+sgm",
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo docs test lint types check clean
+.PHONY: demo docs test fuzz lint types check clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -21,6 +21,9 @@ demo: $(VENV)/.user  ## match a synthetic street with S1 to S4: pictures in demo
 
 test: $(VENV)/.dev  ## all tests, two files at a time
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+
+fuzz: $(VENV)/.dev  ## generated calls and mutated files, ten minutes; FUZZ="--seed 2 --minutes 1" for others
+	cd tests && ../$(BIN)/python -m fuzz $(FUZZ)
 
 docs: $(VENV)/.dev  ## the documentation, in docs/_build/html; warnings are errors
 	NUMBA_CACHE_DIR=$(CURDIR)/.numba_cache $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs docs/_build/html

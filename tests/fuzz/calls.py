@@ -228,7 +228,8 @@ def bad_image(rng: Rng, image: np.ndarray) -> Any:
     if kind == 0:
         return NONSENSE[rng.integers(len(NONSENSE))]
     if kind == 1:
-        return image.astype(rng.choice([np.int32, np.int8, np.uint64, np.float16, np.complex64, bool, object]))
+        with np.errstate(all="ignore"):
+            return image.astype(rng.choice([np.int32, np.int8, np.uint64, np.float16, np.complex64, bool, object]))
     if kind == 2:
         return image[: rng.integers(0, 2)]
     if kind == 3:
@@ -274,7 +275,7 @@ def stages(rng: Rng) -> int:
     check(low <= disparity.min() and disparity.max() <= low + count - 1, "selection out of range")
     check(same(least, total.min(axis=2)), "cost of the winner")
     check(confidence.min() >= 0 and confidence.max() <= 1, "confidence out of range")
-    floats = rng.random((*left.shape[:2], count)).astype(np.float32) * rng.choice([1.0, 1e-38, 1e38])
+    floats = rng.random((*left.shape[:2], count)).astype(np.float32) * np.float32(rng.choice([1.0, 1e-38, 1e38]))
     floats[rng.random(floats.shape) < rng.choice([0, 0.3, 1])] = rng.choice([np.nan, np.inf])
     disparity, least, confidence = stereokit.select(floats, min_disparity=low)
     nothing = ~np.isfinite(floats).any(axis=2)

@@ -15,12 +15,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from numba.extending import overload
 
-__all__ = ["FINGERPRINT", "inline", "kernel"]
+__all__ = ["FINGERPRINT", "by_types", "inline", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -52,3 +54,17 @@ def inline(function: F) -> F:
     """Compile `function` as a helper that kernels call and that is always inlined into them."""
     compiled: F = numba.njit(forceinline=True, **_FLAGS)(function)
     return compiled
+
+
+def by_types(choose: F) -> F:
+    """Make a helper whose code depends on the types of its arguments, always inlined into the kernels that call it.
+
+    `choose` is called with numba's types when a kernel is compiled, and returns the function to compile for them.
+    """
+
+    @wraps(choose)
+    def stub(*arguments: Any) -> Any:
+        raise NotImplementedError("compiled code only")
+
+    overload(stub, strict=False, jit_options={"forceinline": True})(choose)
+    return stub  # type: ignore[return-value]

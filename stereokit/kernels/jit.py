@@ -14,6 +14,7 @@ an upgrade, or an edit anywhere, nothing stale is ever loaded.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -22,13 +23,17 @@ from typing import Any, TypeVar
 import numba
 from numba.extending import overload
 
-__all__ = ["FINGERPRINT", "by_types", "inline", "kernel"]
+__all__ = ["CHECKED", "FINGERPRINT", "by_types", "inline", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+CHECKED = os.environ.get("STEREOKIT_CHECKED", "0") not in ("", "0")
+"""Whether kernels check each access to an array; one outside of it ends the process. For tests: slow to compile."""
+
+
 def _fingerprint() -> str:
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(b"checked" if CHECKED else b"")
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
@@ -40,7 +45,7 @@ FINGERPRINT = _fingerprint()
 
 # Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
 # a pixel; for the same reason kernels cannot allocate: buffers come in as arguments.
-_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "boundscheck": CHECKED}
 
 
 def kernel(function: F) -> F:

@@ -31,13 +31,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numba import types
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, cost_row
 from stereokit.errors import OptionError, shown
 from stereokit.images.gray import check_integer, check_number
-from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import (
     LANES,
     add,
@@ -200,16 +199,12 @@ def edge_weights() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return row, column
 
 
+@by_types
 def _feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     """Return ``value + weight * (before - keep * value)`` of int16 or float32 vectors; compiled code only.
 
     Fixed point rounds down.
     """
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_feed_back, strict=False, jit_options={"forceinline": True})
-def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     if value.scalar == types.int16:
         return lambda value, before, weight, keep: add(
             value, multiply_high(shift_left(subtract(before, value), 1), weight)
@@ -217,13 +212,9 @@ def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     return lambda value, before, weight, keep: add(value, multiply(weight, subtract(before, multiply(keep, value))))
 
 
+@by_types
 def _feed_back_up(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     """Return what `_feed_back` does, but fixed point rounds up: the way back makes up for the way there."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_feed_back_up, strict=False, jit_options={"forceinline": True})
-def _choose_feed_back_up(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     if value.scalar == types.int16:
         return lambda value, before, weight, keep: subtract(
             value, multiply_high(shift_left(subtract(value, before), 1), weight)
@@ -231,25 +222,17 @@ def _choose_feed_back_up(value: Any, before: Any, weight: Any, keep: Any) -> Any
     return lambda value, before, weight, keep: _feed_back(value, before, weight, keep)
 
 
-def _unpack(costs: Any, at: int, shift: int, like: Any) -> Any:
+@by_types
+def _unpack(costs: Any, at: Any, shift: Any, like: Any) -> Any:
     """64 costs of the volume in the type of `like`; compiled code only."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_unpack, strict=False, jit_options={"forceinline": True})
-def _choose_unpack(costs: Any, at: Any, shift: Any, like: Any) -> Any:
     if costs.dtype == types.uint8:
         return lambda costs, at, shift, like: shift_left(convert(load(costs, at), like), shift)
     return lambda costs, at, shift, like: load(costs, at)
 
 
-def _pack(costs: Any, at: int, value: Any, shift: int) -> None:
+@by_types
+def _pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
     """Put 64 costs into the volume, rounded to what it holds; compiled code only."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_pack, strict=False, jit_options={"forceinline": True})
-def _choose_pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
     if costs.dtype == types.uint8:
         # Half a step is added before the shift; the largest cost, 255, must not pass the byte.
         return lambda costs, at, value, shift: store(

@@ -1,15 +1,10 @@
 """The one home of numba's flags.
 
-Every kernel is compiled on first use for the types that it meets, kept in numba's disk cache, releases the
+Every kernel is compiled on first use for the types that it meets, kept on disk (`stereokit.kernels.cache`), releases the
 interpreter lock so that plain threads run it side by side, and divides as numpy does (no zero-division
 exception inside loops). There is no ``fastmath``: results must not depend on the processor. There is no
 ``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.threads` runs
 several of them at once, which is safe from any number of calling threads and compiles in half the time.
-
-What is compiled is kept where numba keeps it: in the folder that ``NUMBA_CACHE_DIR`` names, beside the source, or in
-the user's cache. Where none of these can be written, as in a read-only container, it goes to a folder of temporary
-files that is the user's alone, and where that cannot be either, it is compiled again in every process. A file of the
-cache that is damaged (a full disk, a power cut) counts as absent, and is written again.
 
 Numba files a compiled kernel under the name of its function and looks only at the file which that stands in, not
 at the functions that are compiled into it. So each name carries a fingerprint of the whole package's source: after
@@ -20,26 +15,27 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
-import stat
-import tempfile
-import warnings
 from collections.abc import Callable
-from contextlib import suppress
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
-from numba.core.serialize import dumps
+from numba.extending import overload
 
-__all__ = ["FINGERPRINT", "inline", "kernel"]
+from stereokit.kernels.cache import cache_of
+
+__all__ = ["CHECKED", "FINGERPRINT", "by_types", "inline", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+CHECKED = os.environ.get("STEREOKIT_CHECKED", "0") not in ("", "0")
+"""Whether kernels check each access to an array; one outside of it ends the process. For tests: slow to compile."""
+
+
 def _fingerprint() -> str:
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(b"checked" if CHECKED else b"")
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
@@ -51,124 +47,7 @@ FINGERPRINT = _fingerprint()
 
 # Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
 # a pixel; for the same reason kernels cannot allocate: buffers come in as arguments.
-_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
-
-
-_warned = False
-
-
-def _warn(message: str) -> None:
-    """Warn once in a process, however many kernels there are."""
-    global _warned
-    if not _warned:
-        _warned = True
-        warnings.warn(f"{message}; NUMBA_CACHE_DIR can name a folder for them", RuntimeWarning, stacklevel=2)
-
-
-def _temporary_folder() -> Path | None:
-    """Return a folder of temporary files that nobody else can write to, or None: what is in it will be executed."""
-    user = os.getuid() if hasattr(os, "getuid") else None  # on Windows temporary files are the user's alone
-    try:
-        folder = Path(tempfile.gettempdir(), "stereokit" if user is None else f"stereokit-{user}")
-        if folder.parent == Path.cwd():  # where there is no place for temporary files
-            return None
-        with suppress(FileExistsError):
-            folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if not stat.S_ISDIR(found.st_mode) or (user is not None and (found.st_uid != user or found.st_mode & 0o077)):
-            return None
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError:
-        return None
-    return folder
-
-
-class _TemporaryLocator:
-    """Where numba finds and puts the files of a function if there is no other place for them."""
-
-    def __init__(self, function: Any, file: str, folder: Path) -> None:
-        self._stamp = hashlib.sha256(Path(file).read_bytes()).hexdigest()
-        self._line = function.__code__.co_firstlineno
-        self._folder = folder / hashlib.sha256(os.path.abspath(file).encode()).hexdigest()[:16]
-
-    @classmethod
-    def from_function(cls, function: Any, file: str) -> _TemporaryLocator | None:
-        """Return the locator of a function in a file, or None if there is no such place."""
-        folder = _temporary_folder()
-        if folder is None:
-            return None
-        try:
-            locator = cls(function, file, folder)
-            locator.ensure_cache_path()
-        except OSError:
-            return None
-        _warn(f"compiled kernels are kept in {folder}, as no other folder for them can be written")
-        return locator
-
-    def ensure_cache_path(self) -> None:
-        """Make the folder."""
-        self._folder.mkdir(exist_ok=True)
-
-    def get_cache_path(self) -> str:
-        """Return the folder."""
-        return str(self._folder)
-
-    def get_source_stamp(self) -> str:
-        """Return what changes with the source."""
-        return self._stamp
-
-    def get_disambiguator(self) -> str:
-        """Return what tells functions of one name apart."""
-        return str(self._line)
-
-
-class _CheckedFiles(CompileResultCacheImpl):  # type: ignore[misc]
-    """Numba's way of keeping compiled functions, with a digest: a damaged one might crash or compute something else."""
-
-    _locator_classes = (*CompileResultCacheImpl._locator_classes, _TemporaryLocator)
-
-    def reduce(self, cres: Any) -> tuple[bytes, bytes]:
-        """Return what is written to a file."""
-        content = dumps(super().reduce(cres))
-        return hashlib.sha256(content).digest(), content
-
-    def rebuild(self, target_context: Any, payload: tuple[bytes, bytes]) -> Any:
-        """Return what was compiled."""
-        digest, content = payload
-        if hashlib.sha256(content).digest() != digest:
-            raise ValueError("damaged file of the cache")
-        return super().rebuild(target_context, pickle.loads(content))
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """Numba's cache of a function, but no file in it, and none that cannot be written, keeps the function from work."""
-
-    _impl_class = _CheckedFiles
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what was compiled for a signature, or None."""
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # whatever unpickling makes of damaged files
-            with suppress(OSError):
-                self.flush()  # an index that can be read, or nothing could be added
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Write what was compiled for a signature."""
-        try:
-            super().save_overload(sig, data)
-        except OSError as error:
-            self.disable()
-            _warn(f"compiled kernels cannot be kept ({error})")
-
-
-def _cache_of(function: Any) -> Any:
-    try:
-        return _Cache(function)
-    except (OSError, RuntimeError):  # numba found no place
-        _warn("kernels are compiled again in every process, as no folder for them can be written")
-        return NullCache()
+_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "boundscheck": CHECKED}
 
 
 def kernel(function: F) -> F:
@@ -176,7 +55,7 @@ def kernel(function: F) -> F:
     function.__qualname__ = f"{function.__qualname__}_{FINGERPRINT}"
     compiled: F = numba.njit(**_FLAGS)(function)
     if hasattr(compiled, "_cache"):  # not where NUMBA_DISABLE_JIT is set
-        compiled._cache = _cache_of(function)
+        compiled._cache = cache_of(function)
     return compiled
 
 
@@ -184,3 +63,17 @@ def inline(function: F) -> F:
     """Compile `function` as a helper that kernels call and that is always inlined into them."""
     compiled: F = numba.njit(forceinline=True, **_FLAGS)(function)
     return compiled
+
+
+def by_types(choose: F) -> F:
+    """Make a helper whose code depends on the types of its arguments, always inlined into the kernels that call it.
+
+    `choose` is called with numba's types when a kernel is compiled, and returns the function to compile for them.
+    """
+
+    @wraps(choose)
+    def stub(*arguments: Any) -> Any:
+        raise NotImplementedError("compiled code only")
+
+    overload(stub, strict=False, jit_options={"forceinline": True})(choose)
+    return stub  # type: ignore[return-value]

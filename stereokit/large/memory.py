@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 from stereokit.errors import OptionError
 
 __all__ = ["free_nbytes", "parse_memory", "resident_nbytes"]
 
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
-_UNKNOWN_NBYTES = 400_000_000
-"""What is taken for the process where the system does not tell."""
 
 
 def parse_memory(memory: Any) -> int:
@@ -37,16 +34,9 @@ def parse_memory(memory: Any) -> int:
 
 def resident_nbytes() -> int:
     """Return the bytes of memory that the process occupies now."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, AttributeError):  # not on Linux
-        return _UNKNOWN_NBYTES
+    return int(psutil.Process().memory_info().rss)
 
 
 def free_nbytes() -> int:
-    """Return the bytes that the machine could still give, 4 GB where the system does not tell."""
-    try:
-        found = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())
-    except OSError:
-        found = None
-    return 4 * 10**9 if found is None else 1024 * int(found[1])
+    """Return the bytes that the machine could still give."""
+    return int(psutil.virtual_memory().available)

@@ -206,12 +206,12 @@ def test_every_peer_finds_a_shift(name):
 
 
 def test_a_peer_that_the_machine_cannot_hold_is_left_out(monkeypatch):
-    monkeypatch.setattr(command, "_free_bytes", lambda: 1e9)
+    monkeypatch.setattr(command, "free_nbytes", lambda: 10**9)
     big = Size("big", 4000, 3000, 256)
     assert command._too_large(peers.HH, big) == "needs 12.3 GB of memory, 1.0 GB are free"
     assert command._too_large(peers.HH, SIZES["K"]) is None
     assert command._too_large("census+sgm", big) is None
-    monkeypatch.setattr(command, "_free_bytes", lambda: None)
+    monkeypatch.setattr(command, "free_nbytes", lambda: 16 * 10**9)
     assert command._too_large(peers.HH, big) is None
 
 

@@ -16,7 +16,7 @@ import pytest
 
 import stereokit
 import stereokit_refiners
-from stereokit.kernels import jit
+from stereokit.kernels import cache
 
 USE = """
     import warnings
@@ -147,10 +147,23 @@ def test_a_cache_that_cannot_be_written_any_more_is_warned_of_once(kernels, monk
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("numba.core.caching.IndexDataCacheFile._save_data", full)
-    monkeypatch.setattr(jit, "_warned", False)
+    monkeypatch.setattr(cache, "_warned", False)
     with pytest.warns(RuntimeWarning, match=r"No space left.*NUMBA_CACHE_DIR"):
         double(kernels())
     double(kernels())  # a second warning would be an error
+
+
+def test_a_cache_that_can_only_be_read_is_read(kernels, monkeypatch):
+    double(kernels())
+
+    def read_only(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", read_only)  # with which numba and we look whether we may write
+    monkeypatch.setattr(cache, "_warned", False)
+    assert double(kernels())
+    with pytest.warns(RuntimeWarning, match="Permission denied"):  # what is not there cannot be kept
+        assert not double(kernels(), np.float64)
 
 
 def test_a_cache_that_cannot_be_read_is_left_alone(kernels, tmp_path):
@@ -159,5 +172,5 @@ def test_a_cache_that_cannot_be_read_is_left_alone(kernels, tmp_path):
     path.unlink()
     path.mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jit, "_warned", True)
+        patch.setattr(cache, "_warned", True)
         assert not double(kernels())

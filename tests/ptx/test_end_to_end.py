@@ -184,6 +184,20 @@ def test_images_of_the_device_at_half_size(host_as_device, refiner):
         np.testing.assert_allclose(found.confidence, want.confidence, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("low", [5, -7])
+def test_nothing_lies_below_an_odd_minimum_at_half_size(host_as_device, low):
+    pytest.importorskip("torch")
+    pair = _pair(9, 27)
+    options = {"min_disparity": low, "max_disparity": low + 16, "scale": 0.5, "right": True}
+    want = Matcher("S2", device="cpu", **options)(*pair)
+    matcher = Matcher("S2", device="cuda", **options)
+    np.testing.assert_array_equal(matcher(*pair).disparity, want.disparity)
+    found = matcher.on_device(*pair, stream=0)
+    for name in ("disparity", "right"):
+        assert getattr(want, name).min() == getattr(found, name).min() == low
+        np.testing.assert_allclose(getattr(found, name), getattr(want, name), rtol=0, atol=2e-3)
+
+
 def test_refiners_of_the_host_are_not_for_the_device(queues, monkeypatch):
     pair = _pair(9, 27)
     monkeypatch.delattr(Linear, "on_device")

@@ -130,13 +130,21 @@ def checked_image(name: str, image: Any) -> NDArray[Any]:
 
 
 def to_gray(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a checked image in grey: 0.299 R + 0.587 G + 0.114 B."""
+    """Return a checked image in grey: 0.299 R + 0.587 G + 0.114 B; see `_gray_of_floats` for floating point."""
     if array.ndim == 2:
         return array
-    if array.dtype == np.float64:
-        with np.errstate(invalid="ignore"):  # inf - inf, inf * 0: such pixels are bad ones
-            return np.asarray(array @ np.array([0.299, 0.587, 0.114]))
+    if array.dtype.kind == "f":
+        return _gray_of_floats(array)
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(array), cv2.COLOR_RGB2GRAY))
+
+
+def _gray_of_floats(array: NDArray[Any]) -> NDArray[Any]:
+    """Return floats in grey; one operation after the other, as neither OpenCV nor BLAS does on every processor."""
+    with np.errstate(over="ignore", invalid="ignore"):  # inf - inf, inf * 0: such pixels are bad ones
+        gray = array[:, :, 0] * array.dtype.type(0.299)
+        for channel, weight in ((1, 0.587), (2, 0.114)):
+            gray += array[:, :, channel] * array.dtype.type(weight)
+    return np.asarray(gray)
 
 
 def _whole_numbers(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

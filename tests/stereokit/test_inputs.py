@@ -8,7 +8,7 @@ import pytest
 
 import stereokit
 from stereokit import InputError, Matcher, OptionError, StereokitError, UnknownNameError, match
-from stereokit.images.gray import gray_pair, half_size, smooth
+from stereokit.images.gray import gray_pair, half_size, smooth, to_gray
 
 METHOD = "census+sgm"
 KEEP_ALL = {"fill": None, "smp": False, "speckle": 0, "uniqueness": 0, "median": 0}
@@ -71,6 +71,16 @@ def test_rgb_is_grey_by_the_usual_weights(dtype):
     pure = np.zeros((1, 3, 3), np.uint8)
     pure[0, range(3), range(3)] = 255
     np.testing.assert_array_equal(gray_pair(pure, pure).left, [[76, 150, 29]])  # red, green, blue
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floats_become_grey_by_one_operation_after_the_other(dtype):
+    """No fused operations and no sums in another order, or the bits would depend on the processor."""
+    image = np.random.default_rng(0).normal(0, 100, (9, 67, 3)).astype(dtype)
+    weights = [dtype(weight) for weight in (0.299, 0.587, 0.114)]
+    expected = [[(r * weights[0] + g * weights[1]) + b * weights[2] for r, g, b in row] for row in image]
+    np.testing.assert_array_equal(to_gray(image), np.array(expected, dtype))
+    assert to_gray(image).dtype == dtype
 
 
 def test_grey_may_have_a_channel_axis():

@@ -22,17 +22,9 @@ from stereokit.costs.rows import Levels, Pair
 from stereokit.cuda.driver import has_device, require_device
 from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
-from stereokit.images.gray import (
-    GrayPair,
-    check_flag,
-    check_integer,
-    check_names,
-    check_number,
-    gray_pair,
-    guide_of,
-    half_size,
-    smooth,
-)
+from stereokit.images.check import check_flag, check_integer, check_names, check_number
+from stereokit.images.gray import GrayPair, gray_pair, guide_of
+from stereokit.images.resize import half_size, smooth
 from stereokit.kernels.threads import available_threads, crew
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.methods import check_levels, find_refiner, option_names, parse_method

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, cost_row
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer, check_number
+from stereokit.images.check import check_integer, check_number
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.simd import (
     LANES,

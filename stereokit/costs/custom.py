@@ -14,7 +14,7 @@ import numpy as np
 
 from stereokit.costs.rows import Pair, VolumeRows
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer
+from stereokit.images.check import check_integer
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 

@@ -1,4 +1,4 @@
-"""The one place where images and options are checked.
+"""From images of any kind to a grey pair.
 
 Whatever comes in (grey or RGB, 8 or 16 bit or floating point, strided, read-only, with NaN) leaves as two grey
 C-contiguous ``uint8`` or ``uint16`` images and the masks of the pixels that carry no evidence. Nothing that comes in
@@ -9,38 +9,24 @@ whole numbers from 0 to 255 become what they are.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, OptionError, did_you_mean
-from stereokit.kernels.threads import run
-from stereokit.kernels.workspace import Workspace
+from stereokit.errors import InputError
+from stereokit.images.check import checked_image, writable
 
 __all__ = [
     "GrayPair",
-    "check_flag",
-    "check_integer",
-    "check_names",
-    "check_number",
-    "checked_image",
     "fill_bad",
     "gray_pair",
     "guide_of",
-    "half_size",
     "scale_guide",
     "scale_to_16_bits",
-    "smooth",
     "to_gray",
 ]
-
-MAX_DISPARITY = 2**20
-"""Bound of `min_disparity`, far beyond any image."""
-
-_TYPES = (np.uint8, np.uint16, np.float32, np.float64)
 
 
 @dataclass(frozen=True)
@@ -66,67 +52,6 @@ class GrayPair:
     right_bad: NDArray[np.bool_] | None
     guide: NDArray[np.uint8]
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
-
-
-def check_integer(name: str, value: Any, low: int | None = None, high: int | None = None) -> int:
-    """Return `value` as an int if it is a whole number from `low` to `high`, else raise OptionError."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        raise OptionError(f"{name} must be an integer, got {value!r}")
-    if (low is not None and value < low) or (high is not None and value > high):
-        rule = f"at least {low}" if high is None else f"from {low} to {high}"
-        raise OptionError(f"{name} must be {rule}, got {value}")
-    return int(value)
-
-
-def check_number(name: str, value: Any, low: float, high: float) -> float:
-    """Return `value` as a float if it lies from `low` to `high`, else raise OptionError."""
-    wrong = isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.number))
-    if wrong or not low <= value <= high:
-        raise OptionError(f"{name} must be a number from {low:g} to {high:g}, got {value!r}")
-    return float(value)
-
-
-def check_flag(name: str, value: Any) -> bool:
-    """Return `value` if it is True or False, else raise OptionError."""
-    if not isinstance(value, (bool, np.bool_)):
-        raise OptionError(f"{name} must be True or False, got {value!r}")
-    return bool(value)
-
-
-def check_names(kind: str, given: Any, known: Any) -> None:
-    """Raise OptionError with the nearest known name for the first of `given` that is not in `known`."""
-    for name in given:
-        if name not in known:
-            raise OptionError(did_you_mean(kind, str(name), known))
-
-
-def writable(array: Any) -> NDArray[Any]:
-    """Return `array`, or a copy, C-contiguous and writable: what kernels were compiled for. It is not written to."""
-    contiguous = np.ascontiguousarray(array)
-    return contiguous if contiguous.flags.writeable else contiguous.copy()
-
-
-def checked_image(name: str, image: Any) -> NDArray[Any]:
-    """Return an image of an accepted type and shape, (H, W) or (H, W, 3)."""
-    if isinstance(image, np.ma.MaskedArray):
-        raise InputError(f"{name} must be a plain array, got a masked one; put NaN where there is no evidence")
-    if hasattr(image, "__cuda_array_interface__"):
-        raise InputError(f"{name} must lie in host memory here, got an array on a GPU; see Matcher.on_device")
-    try:
-        array = np.asarray(image)
-    except ValueError as error:
-        raise InputError(f"{name} must be an array of numbers: {error}") from None
-    if array.dtype.byteorder not in "=|":
-        array = array.astype(array.dtype.newbyteorder("="))
-    if array.dtype not in _TYPES:
-        raise InputError(f"{name} must be uint8, uint16, float32 or float64, got {array.dtype}")
-    if array.ndim == 3 and array.shape[2] == 1:
-        array = array[:, :, 0]
-    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
-        raise InputError(f"{name} must be grey (H, W) or RGB (H, W, 3), got shape {array.shape}")
-    if 0 in array.shape:
-        raise InputError(f"{name} must not be empty, got shape {array.shape}")
-    return array
 
 
 def to_gray(array: NDArray[Any]) -> NDArray[Any]:
@@ -233,58 +158,3 @@ def scale_guide(image: NDArray[Any], low: int, high: int) -> NDArray[np.uint8]:
     """Return grey values from `low` to `high` in 256 levels."""
     scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1))
     return np.asarray(np.rint(scaled), np.uint8)
-
-
-def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, threads: int = 1) -> GrayPair:
-    """Return the pair with both images smoothed by a Gaussian; the guide stays as sharp as it was.
-
-    The result is 16 bit, so that nothing is lost to rounding: 8-bit images are multiplied by 256 first.
-
-    Parameters
-    ----------
-    pair : GrayPair
-    sigma : float
-        Standard deviation in pixels; 0 returns the pair itself.
-    workspace : Workspace or None
-        Where the smoothed images are kept until the next call; None makes new ones.
-    threads : int
-        Threads to use.
-    """
-    if sigma == 0:
-        return pair
-    held = workspace or Workspace()
-    images = pair.left, pair.right
-    wide, blurred = ([held.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
-
-    def blur(k: int) -> None:
-        image = images[k]
-        if image.dtype == np.uint8:
-            image = np.multiply(image, np.uint16(256), out=wide[k])
-        cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
-
-    run([partial(blur, 0), partial(blur, 1)], threads)
-    return GrayPair(blurred[0], blurred[1], pair.left_bad, pair.right_bad, pair.guide, pair.ranges)
-
-
-def half_size(pair: GrayPair) -> GrayPair:
-    """Return the pair at half size, ``(ceil(H/2), ceil(W/2))``: the mean of each 2x2 pixels.
-
-    Odd sizes are extended by their last row or column. A pixel is bad if one of its four is.
-    """
-
-    def shrink(image: NDArray[Any]) -> NDArray[Any]:
-        height, width = image.shape
-        even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-        size = (even.shape[1] // 2, even.shape[0] // 2)
-        return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0])
-
-    def shrink_bad(bad: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-        if bad is None:
-            return None
-        height, width = bad.shape
-        even = np.pad(bad, ((0, height % 2), (0, width % 2)))
-        return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))
-
-    left, right = shrink(pair.left), shrink(pair.right)
-    guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
-    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide, pair.ranges)

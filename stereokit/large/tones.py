@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.images.gray import GrayPair, fill_bad, half_size, scale_guide, scale_to_16_bits, smooth, to_gray
+from stereokit.images.gray import GrayPair, fill_bad, scale_guide, scale_to_16_bits, to_gray
+from stereokit.images.resize import half_size, smooth
 from stereokit.large.sources import Source
 
 __all__ = ["BLOCK_NBYTES", "Tone", "find_ranges", "find_tone", "read_pair"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.images.gray import check_integer, check_number
+from stereokit.images.check import check_integer, check_number
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace

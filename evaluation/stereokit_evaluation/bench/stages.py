@@ -32,7 +32,7 @@ GROUPS = ("prepare", "match", "clean", "refine")
 """Groups of stages in their order: checks, resizing and what a cost prepares; the sweep, which makes costs, adds them
 up and selects in one pass; the post-processing; and the refiner."""
 
-_STAGES = {"stereokit.images.gray": "prepare", "stereokit.postprocess": "clean", "stereokit.selection": "clean"}
+_STAGES = {"stereokit.images": "prepare", "stereokit.postprocess": "clean", "stereokit.selection": "clean"}
 
 
 class Watch:

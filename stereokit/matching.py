@@ -22,7 +22,7 @@ from stereokit.costs.rows import Levels, Pair
 from stereokit.cuda.driver import has_device, require_device
 from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
-from stereokit.images.check import check_flag, check_integer, check_names, check_number
+from stereokit.images.check import check_flag, check_integer, check_names, check_nodata, check_number
 from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.images.resize import half_size, smooth
 from stereokit.kernels.threads import available_threads, crew
@@ -43,6 +43,7 @@ _PIPELINE = (
     "confidence",
     "fill",
     "median",
+    "nodata",
     "outside",
     "right",
     "smooth",
@@ -82,8 +83,10 @@ class Matcher:
         ``uniqueness`` (percent by which the best rival must cost more, or the pixel is invalid), ``smp`` (bool,
         single matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the
         image), ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of the cost's
-        range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the right view's map
-        too; twice the time). Defaults are those of `stereokit.defaults`.
+        range, or None for the nearest border pixel), ``nodata`` (value of pixels that hold nothing, which match nothing
+        and are never ``valid``; None leaves it to NaN, alpha and what `stereokit.images.intensity` sees by itself),
+        ``confidence`` (bool) and ``right`` (bool, the right view's map too; twice the time). Defaults are those of
+        `stereokit.defaults`.
 
     Raises
     ------
@@ -181,6 +184,7 @@ class Matcher:
         self.median = check_integer("median", merged["median"])
         if self.median not in (0, 3, 5):
             raise OptionError(f"median must be 0, 3 or 5, got {self.median}")
+        self.nodata = check_nodata(merged["nodata"])
         outside = merged["outside"]
         self.outside = None if outside is None else check_number("outside", outside, 0, 1)
         self.smooth = check_number("smooth", merged["smooth"], 0, 10)
@@ -231,6 +235,8 @@ class Matcher:
         """
         if self._cuda is None:
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
+        if self.nodata is not None:
+            raise DeviceError(f"nodata must be None for images on the device, got {self.nodata:g}")
         found = self._cuda.device(left, right, stream)
         return found if self.confidence else replace(found, confidence=None)
 
@@ -239,8 +245,10 @@ class Matcher:
 
         Parameters
         ----------
-        left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
-            Grey or RGB, of one size and type; never modified. NaN and infinite pixels count as no evidence.
+        left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
+            Grey, RGB or RGBA, of one size and type; never modified. One may be grey and the other in colour: both are
+            matched in grey. Pixels that are NaN, infinite, `nodata`, of alpha 0 or evident marks such as -3.4e38
+            count as no evidence.
 
         Returns
         -------
@@ -253,6 +261,11 @@ class Matcher:
         ------
         InputError
             If the images cannot be used.
+
+        Warns
+        -----
+        StereokitWarning
+            If few grey levels hold nearly all pixels of images of more than 8 bits.
         """
         return self._call(left, right, self.threads)
 
@@ -311,7 +324,7 @@ class Matcher:
                     waiting.cancel()
 
     def _call(self, left: Any, right: Any, threads: int) -> Disparity:
-        pair = gray_pair(left, right)
+        pair = gray_pair(left, right, self.nodata)
         with self._pool.take() as workspace:
             full = self.match_gray(pair, workspace, threads)
             if not self.right:
@@ -376,8 +389,8 @@ def match(left: Any, right: Any, method: str = "zncc+sgm", **options: Any) -> ND
 
     Parameters
     ----------
-    left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
-        Rectified images of one size and type, grey or RGB.
+    left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
+        Rectified images of one size and type, grey, RGB or RGBA.
     method : str
         ``"cost+aggregation"`` or S1 to S4.
     **options

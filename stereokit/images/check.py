@@ -11,9 +11,11 @@ from stereokit.errors import InputError, OptionError, did_you_mean
 
 __all__ = [
     "MAX_DISPARITY",
+    "accepted_type",
     "check_flag",
     "check_integer",
     "check_names",
+    "check_nodata",
     "check_number",
     "checked_image",
     "writable",
@@ -50,6 +52,15 @@ def check_flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def check_nodata(value: Any) -> float | None:
+    """Return `value` as a float if it is a number, None if it is None or NaN, else raise OptionError."""
+    if value is None:
+        return None
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise OptionError(f"nodata must be a number or None, got {value!r}")
+    return None if np.isnan(value) else float(value)
+
+
 def check_names(kind: str, given: Any, known: Any) -> None:
     """Raise OptionError with the nearest known name for the first of `given` that is not in `known`."""
     for name in given:
@@ -64,7 +75,9 @@ def writable(array: Any) -> NDArray[Any]:
 
 
 def checked_image(name: str, image: Any) -> NDArray[Any]:
-    """Return an image of an accepted type and shape, (H, W) or (H, W, 3)."""
+    """Return an image as uint8, uint16, float32 or float64, (H, W), (H, W, 3) or, with alpha, (H, W, 4)."""
+    if image is None:
+        raise InputError(f"{name} must be an image, got None: was the file read?")
     if isinstance(image, np.ma.MaskedArray):
         raise InputError(f"{name} must be a plain array, got a masked one; put NaN where there is no evidence")
     if hasattr(image, "__cuda_array_interface__"):
@@ -73,14 +86,27 @@ def checked_image(name: str, image: Any) -> NDArray[Any]:
         array = np.asarray(image)
     except ValueError as error:
         raise InputError(f"{name} must be an array of numbers: {error}") from None
-    if array.dtype.byteorder not in "=|":
-        array = array.astype(array.dtype.newbyteorder("="))
-    if array.dtype not in _TYPES:
-        raise InputError(f"{name} must be uint8, uint16, float32 or float64, got {array.dtype}")
+    kind = accepted_type(array.dtype)
+    if kind is None:
+        raise InputError(f"{name} must be of whole or floating-point numbers of at most 64 bits, got {array.dtype}")
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
-    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
-        raise InputError(f"{name} must be grey (H, W) or RGB (H, W, 3), got shape {array.shape}")
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)):
+        raise InputError(f"{name} must be grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), got shape {array.shape}")
     if 0 in array.shape:
         raise InputError(f"{name} must not be empty, got shape {array.shape}")
-    return array
+    return array.astype(kind, copy=False)
+
+
+def accepted_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:
+    """Return the type among `_TYPES`, in this machine's byte order, that takes the values of another; None if none.
+
+    Whole numbers become floats that hold them: what those are in grey is decided by their values, not by their type.
+    """
+    if dtype.newbyteorder("=") in _TYPES:
+        return dtype.newbyteorder("=")
+    if dtype.kind == "b":
+        return np.dtype(np.uint8)
+    if dtype.kind in "iuf" and dtype.itemsize <= 8:
+        return np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64)
+    return None

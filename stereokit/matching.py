@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Levels, Pair
+from stereokit.costs.rows import Levels, Pair, takes_8_bits
 from stereokit.cuda.driver import has_device, require_device
 from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
@@ -348,7 +348,7 @@ class Matcher:
 
     def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
         low = levels.minimum
-        pair = smooth(pair, self.smooth, workspace, threads)
+        pair = smooth(pair, self.smooth, workspace, threads, eight_bits=takes_8_bits(self.cost))
         shape = pair.left.shape
         rows = self.cost.prepare(
             Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads, pair.ranges),
@@ -377,7 +377,7 @@ def _mirror(pair: GrayPair) -> GrayPair:
     left, right = flip(pair.right), flip(pair.left)
     assert left is not None and right is not None
     ranges = None if pair.ranges is None else (pair.ranges[1], pair.ranges[0])
-    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges)
+    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges, pair.span)
 
 
 _matchers: dict[Any, Matcher] = {}

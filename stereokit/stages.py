@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume
+from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume, takes_8_bits
 from stereokit.errors import InputError, OptionError
 from stereokit.images.check import check_integer, check_nodata, check_number, writable
 from stereokit.images.gray import gray_pair
@@ -66,7 +66,8 @@ def cost_volume(
     levels = check_levels(min_disparity, max_disparity)
     count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
     share = None if outside is None else check_number("outside", outside, 0, 1)
-    gray = smoothed(gray_pair(left, right, check_nodata(nodata)), check_number("smooth", smooth, 0, 10))
+    sigma = check_number("smooth", smooth, 0, 10)
+    gray = smoothed(gray_pair(left, right, check_nodata(nodata)), sigma, eight_bits=takes_8_bits(stage))
     pair = Pair(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
     return produce_volume(stage.prepare(pair, Workspace(), count), gray.left.shape, levels, count)
 

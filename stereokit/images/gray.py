@@ -40,6 +40,8 @@ class GrayPair:
     ranges : ((int, int), (int, int)) or None
         Smallest and largest value of either image as a cost sees it, halved and smoothed, where this pair is a
         window of larger images; None where it is the whole.
+    span : (int, int)
+        Grey values, of 16 bits, from and to which the guide's 256 levels reach.
     """
 
     left: NDArray[Any]
@@ -48,6 +50,7 @@ class GrayPair:
     right_bad: NDArray[np.bool_] | None
     guide: NDArray[np.uint8]
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
+    span: tuple[int, int] = (0, 65535)
 
 
 def gray_pair(left: Any, right: Any, nodata: float | None = None) -> GrayPair:
@@ -75,7 +78,7 @@ def gray_pair(left: Any, right: Any, nodata: float | None = None) -> GrayPair:
     tone = find_tone(lambda: [(0, image) for image in images], images[0].dtype, images[0].shape, nodata)
     (a, left_bad), (b, right_bad) = (tone.apply(image) for image in images)
     a, b = writable(a), writable(b)
-    return GrayPair(a, b, left_bad, right_bad, tone.guide(a))
+    return GrayPair(a, b, left_bad, right_bad, tone.guide(a), span=tone.span)
 
 
 def check_same(left: Any, right: Any, *given: Any) -> None:

@@ -114,8 +114,12 @@ class Tone:
         """Return grey values of `kind` in the guide's 256 levels."""
         if gray.dtype == np.uint8:
             return gray
-        low, high = (0, 65535) if self.scaled else (int(self.low), int(self.high))
-        return scale_guide(gray, low, high)
+        return scale_guide(gray, *self.span)
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Grey values, of 16 bits, from and to which the guide's levels reach."""
+        return (0, 65535) if self.scaled else (int(self.low), int(self.high))
 
 
 def find_tone(

@@ -10,16 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.images.gray import GrayPair
+from stereokit.images.intensity import scale_guide
 from stereokit.kernels.threads import run
 from stereokit.kernels.workspace import Workspace
 
 __all__ = ["half_size", "smooth"]
 
 
-def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, threads: int = 1) -> GrayPair:
+def smooth(
+    pair: GrayPair, sigma: float, workspace: Workspace | None = None, threads: int = 1, *, eight_bits: bool = False
+) -> GrayPair:
     """Return the pair with both images smoothed by a Gaussian; the guide stays as sharp as it was.
 
-    The result is 16 bit, so that nothing is lost to rounding: 8-bit images are multiplied by 256 first.
+    The result is 16 bit, so that nothing is lost to rounding: 8-bit images are multiplied by 256 first. For costs that
+    take 8 bits only, it is rounded to 8 bits in the end, and images of 16 bits are brought to 256 levels first.
 
     Parameters
     ----------
@@ -30,7 +34,12 @@ def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, thr
         Where the smoothed images are kept until the next call; None makes new ones.
     threads : int
         Threads to use.
+    eight_bits : bool
+        Whether the result is of 8 bits, whatever the pair is.
     """
+    if eight_bits and pair.left.dtype != np.uint8:
+        left, right = scale_guide(pair.left, *pair.span), scale_guide(pair.right, *pair.span)
+        pair = GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide)
     if sigma == 0:
         return pair
     held = workspace or Workspace()
@@ -44,7 +53,8 @@ def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, thr
         cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
 
     run([partial(blur, 0), partial(blur, 1)], threads)
-    return GrayPair(blurred[0], blurred[1], pair.left_bad, pair.right_bad, pair.guide, pair.ranges)
+    left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
+    return GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide, pair.ranges, pair.span)
 
 
 def half_size(pair: GrayPair) -> GrayPair:
@@ -68,4 +78,4 @@ def half_size(pair: GrayPair) -> GrayPair:
 
     left, right = shrink(pair.left), shrink(pair.right)
     guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
-    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide, pair.ranges)
+    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide, pair.ranges, pair.span)

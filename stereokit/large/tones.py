@@ -62,7 +62,7 @@ def read_pair(
                 guide[rows] = tone.guide(image[rows])
         images.append(image)
         masks.append(mask)
-    return GrayPair(images[0], images[1], masks[0], masks[1], images[0] if guide is None else guide, ranges)
+    return GrayPair(images[0], images[1], masks[0], masks[1], images[0] if guide is None else guide, ranges, tone.span)
 
 
 def find_ranges(left: Source, right: Source, tone: Tone, halved: bool, sigma: float, threads: int) -> Ranges:

@@ -40,6 +40,7 @@ _REACH = 0.5  # widths of the core that are kept on either side of it
 _APART = 10.0  # widths of the core
 _APART_NEGATIVE = 0.5
 _MARKS = 3
+_ROUNDS = 4  # after each, the rest is looked at again
 _FEWEST = 16  # different values that the rest must have for an extreme one to be a mark
 _LEVELS = 64  # that should hold `_MOST` of the pixels, of the guide's 256
 _MOST = 0.99
@@ -147,7 +148,7 @@ def find_tone(
     if dtype == np.uint8:
         return tone
     step = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _SAMPLE)))
-    for attempt in (1, 2):
+    for _ in range(_ROUNDS):
         if dtype.kind == "f":
             tone = replace(tone, whole=_whole(replace(tone, whole=None), blocks))
         if tone.whole == _EIGHT:
@@ -155,10 +156,10 @@ def find_tone(
         sample, low, high = _survey(tone, blocks, step)
         if dtype == np.uint16 and high <= 255:
             return tone
-        below, above = _marks(sample) if attempt == 1 else (-math.inf, math.inf)
+        below, above = _marks(sample)
         if math.isinf(below) and math.isinf(above):
             break
-        tone = replace(tone, below=below, above=above)
+        tone = replace(tone, below=max(tone.below, below), above=min(tone.above, above))
     if sample.size > 0:
         first, last = _core(sample)
         reach = _REACH * last - _REACH * first
@@ -301,8 +302,17 @@ def _core(sample: NDArray[Any]) -> tuple[float, float]:
 
 def _marks(sample: NDArray[Any]) -> tuple[float, float]:
     """Return below and above what values a sorted sample has marks of missing pixels; infinite where it has none."""
+    few = int(_TAIL / 2 * sample.size)
+    for part in (sample[few : sample.size - few], sample):  # without hot pixels, which may lie beyond a mark, and with
+        found = _marks_at_the_ends(part)
+        if found is not None:
+            return found
+    return -math.inf, math.inf
+
+
+def _marks_at_the_ends(sample: NDArray[Any]) -> tuple[float, float] | None:
     starts = np.concatenate([[0], np.flatnonzero(sample[1:] != sample[:-1]) + 1, [sample.size]])
-    found, most = (-math.inf, math.inf), 0
+    found, most = None, 0
     for lower, upper in itertools.product(range(_MARKS + 1), repeat=2):
         if lower + upper <= most or starts.size - 1 - lower - upper < _FEWEST:
             continue

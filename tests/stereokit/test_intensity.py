@@ -98,6 +98,16 @@ def test_many_outliers_of_all_sizes(scene, method):
     assert len(np.unique(guide)) > 100
 
 
+def test_a_mark_is_seen_behind_hot_pixels(scene):
+    rng = np.random.default_rng(10)
+    left, right = put(as_floats(scene), "border", 300)
+    hot = rng.random(left.shape) < 0.001
+    left[hot] = rng.uniform(1000, 1e6, np.count_nonzero(hot))
+    pair = gray_pair(left, right)
+    np.testing.assert_array_equal(pair.left_bad, left >= 300)
+    assert len(np.unique(pair.guide)) > 200
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_evident_marks_and_nodata_are_never_valid(scene, method):
     marked = put(as_floats(scene), "border", -9999)

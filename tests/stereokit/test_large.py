@@ -80,7 +80,7 @@ def kinds():
         "whole floats with holes": whole_holes,
         "floats with a mark": marked(real, -9999),
         "uint16 with a mark and outliers": marked(wide, 65535, hot=True),
-        "floats with outliers": marked(real, 3.0, hot=True),
+        "floats with outliers": marked(real, 300.0, hot=True),
         "int16 with a mark": marked((left.astype(np.int16), right.astype(np.int16)), -32768),
         "rows without evidence": (np.where(np.arange(70)[:, None] == 9, np.nan, real[0] + 1000), real[1] + 1000.0),
         "rgba": tuple(np.dstack([image, 255 * (image[..., :1] > 40)]) for image in rgb),

@@ -15,6 +15,7 @@ __all__ = [
     "InputError",
     "OptionError",
     "StereokitError",
+    "StereokitWarning",
     "UnknownNameError",
     "did_you_mean",
     "shown",
@@ -43,6 +44,10 @@ class UnknownNameError(OptionError):
 
 class FileError(StereokitError):
     """A file is missing, cannot be read as what it should be, or cannot be written."""
+
+
+class StereokitWarning(UserWarning):
+    """Something that was not refused, but hardly gives what was meant."""
 
 
 def shown(value: object) -> str:

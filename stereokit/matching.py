@@ -21,7 +21,8 @@ from stereokit.costs.rows import Cost
 from stereokit.cuda.driver import has_device, require_device
 from stereokit.defaults import METHODS
 from stereokit.errors import DeviceError, InputError, OptionError, shown
-from stereokit.images.gray import GrayPair, check_integer, gray_pair, guide_of
+from stereokit.images.check import check_integer
+from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.pipeline import CpuPipeline, Pipeline
@@ -63,8 +64,10 @@ class Matcher:
         ``uniqueness`` (percent by which the best rival must cost more, or the pixel is invalid), ``smp`` (bool,
         single matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the
         image), ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of the cost's
-        range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the right view's map
-        too; twice the time). Defaults are those of `stereokit.defaults`.
+        range, or None for the nearest border pixel), ``nodata`` (value of pixels that hold nothing, which match nothing
+        and are never ``valid``; None leaves it to NaN, alpha and what `stereokit.images.intensity` sees by itself),
+        ``confidence`` (bool) and ``right`` (bool, the right view's map too; twice the time). Defaults are those of
+        `stereokit.defaults`.
 
     Raises
     ------
@@ -209,6 +212,8 @@ class Matcher:
         """
         if isinstance(self._pipeline, CpuPipeline):
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
+        if self.settings.nodata is not None:
+            raise DeviceError(f"nodata must be None for images on the device, got {self.settings.nodata:g}")
         pipeline: Any = self._pipeline
         result: DeviceDisparity = pipeline.match_on_device(left, right, stream)
         return result
@@ -218,8 +223,10 @@ class Matcher:
 
         Parameters
         ----------
-        left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
-            Grey or RGB, of one size and type; never modified. NaN and infinite pixels count as no evidence.
+        left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
+            Grey, RGB or RGBA, of one size and type; never modified. One may be grey and the other in colour: both are
+            matched in grey. Pixels that are NaN, infinite, `nodata`, of alpha 0 or evident marks such as -3.4e38
+            count as no evidence.
 
         Returns
         -------
@@ -232,6 +239,11 @@ class Matcher:
         ------
         InputError
             If the images cannot be used.
+
+        Warns
+        -----
+        StereokitWarning
+            If few grey levels hold nearly all pixels of images of more than 8 bits.
         """
         return self._call(left, right, self.threads)
 
@@ -295,7 +307,7 @@ class Matcher:
 
     def _call(self, left: Any, right: Any, threads: int) -> Disparity:
         with span("prepare", "checks and grey"):
-            pair = gray_pair(left, right)
+            pair = gray_pair(left, right, self.settings.nodata)
         return self.match_gray(pair, threads)
 
     def match_gray(self, pair: GrayPair, threads: int) -> Disparity:
@@ -330,7 +342,7 @@ def _mirror(pair: GrayPair) -> GrayPair:
     left, right = flip(pair.right), flip(pair.left)
     assert left is not None and right is not None
     ranges = None if pair.ranges is None else (pair.ranges[1], pair.ranges[0])
-    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges)
+    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges, pair.span)
 
 
 _matchers: dict[Any, Matcher] = {}
@@ -342,8 +354,8 @@ def match(left: Any, right: Any, /, method: str = "census+sgm", **options: Any) 
 
     Parameters
     ----------
-    left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
-        Rectified images of one size and type, grey or RGB.
+    left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
+        Rectified images of one size and type, grey, RGB or RGBA.
     method : str
         ``"cost+aggregation"`` or S1 to S4.
     **options

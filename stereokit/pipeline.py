@@ -11,9 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Pair
+from stereokit.costs.rows import Pair, takes_8_bits
 from stereokit.errors import OptionError
-from stereokit.images.gray import GrayPair, half_size, smooth
+from stereokit.images.gray import GrayPair
+from stereokit.images.resize import half_size, smooth
 from stereokit.kernels.threads import team
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
@@ -115,7 +116,7 @@ class CpuPipeline:
             with span("prepare", "half size"):
                 pair = half_size(pair)
         with span("prepare", "smooth"):
-            pair = smooth(pair, settings.smooth, workspace, threads)
+            pair = smooth(pair, settings.smooth, workspace, threads, eight_bits=takes_8_bits(cost))
         shape = pair.left.shape
         with span("prepare", "prepare cost"):
             rows = cost.prepare(

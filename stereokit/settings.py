@@ -13,7 +13,7 @@ from stereokit.aggregation.contract import Aggregation
 from stereokit.costs.rows import Cost, Levels
 from stereokit.defaults import defaults_of
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean, shown
-from stereokit.images.gray import check_flag, check_integer, check_names, check_number
+from stereokit.images.check import check_flag, check_integer, check_names, check_nodata, check_number
 from stereokit.methods import check_levels, find_refiner, option_names, parse_method
 from stereokit.postprocess.chain import Chain
 from stereokit.postprocess.fill import FILLS
@@ -26,6 +26,7 @@ _PIPELINE = (
     "confidence",
     "fill",
     "median",
+    "nodata",
     "outside",
     "right",
     "smooth",
@@ -64,6 +65,8 @@ class MatchSettings:
         Its name, or the path of its weights.
     smooth : float
         Sigma of a Gaussian on both images, pixels; 0 for none.
+    nodata : float or None
+        Value of pixels that hold nothing.
     outside : float or None
         Cost of matches outside the right image, as a share of the cost's range; None takes the border's pixel.
     subpixel : bool
@@ -97,6 +100,7 @@ class MatchSettings:
     refiner: Callable[..., Disparity] | None
     refiner_name: str | None
     smooth: float
+    nodata: float | None
     outside: float | None
     subpixel: bool
     uniqueness: float
@@ -118,6 +122,7 @@ class MatchSettings:
         put("median", check_integer("median", self.median))
         if self.median not in (0, 3, 5):
             raise OptionError(f"median must be 0, 3 or 5, got {self.median}")
+        put("nodata", check_nodata(self.nodata))
         if self.outside is not None:
             put("outside", check_number("outside", self.outside, 0, 1))
         for name, high in (("smooth", 10), ("uniqueness", 100), ("speckle", 1)):

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, cost_row
 from stereokit.errors import OptionError, shown
-from stereokit.images.gray import check_integer, check_number
+from stereokit.images.check import check_integer, check_number
 from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import (
     LANES,

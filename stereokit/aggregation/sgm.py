@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from stereokit.aggregation._paths import CHUNK, PathBuffers, Penalties, finish_part, first_visit, prepare_rows, start
 from stereokit.costs.rows import WORST, Cost, Levels
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer, check_number
+from stereokit.images.check import check_integer, check_number
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, load, store
 from stereokit.kernels.threads import run_stages

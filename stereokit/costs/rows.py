@@ -47,6 +47,7 @@ __all__ = [
     "implements",
     "pad_pair",
     "produce_volume",
+    "takes_8_bits",
 ]
 
 WORST = np.uint8(255)
@@ -129,6 +130,11 @@ class Cost(Protocol):
 
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[Any]:
         """Prepare an image pair; return a row producer, a named tuple, for each of `workers` sweeps."""
+
+
+def takes_8_bits(cost: Any) -> bool:
+    """Return whether a cost is to see images of 8 bits only, smoothed or not: `RowCost` says so."""
+    return bool(getattr(cost, "eight_bits", False))
 
 
 class Cells(NamedTuple):

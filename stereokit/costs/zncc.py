@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer
+from stereokit.images.check import check_integer
 from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import (
     LANES,

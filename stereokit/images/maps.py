@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.images.gray import check_integer
+from stereokit.images.check import check_integer
 
 __all__ = ["check_threads", "checked_map", "numbers"]
 

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.images.intensity import Tone
 from stereokit.large.plan import Cut, Plan
 from stereokit.large.sources import Source
-from stereokit.large.tones import Ranges, Tone, read_pair
+from stereokit.large.tones import Ranges, read_pair
 from stereokit.matching import Matcher
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows

@@ -16,14 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stereokit.errors import InputError, OptionError
-from stereokit.images.gray import check_integer
+import numpy as np
+
+from stereokit.errors import OptionError
+from stereokit.images.check import check_integer
+from stereokit.images.gray import check_same
+from stereokit.images.intensity import Tone
 from stereokit.large.bands import Bands
 from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes
 from stereokit.large.output import check_large_output, write_bands
 from stereokit.large.plan import Plan, plan
 from stereokit.large.sources import Source, open_source
-from stereokit.large.tones import BLOCK_NBYTES, Ranges, Tone, find_ranges, find_tone
+from stereokit.large.tones import BLOCK_NBYTES, Ranges, find_ranges, tone_of
 from stereokit.matching import Matcher
 
 __all__ = ["OVERLAP", "LargeResult", "match_large"]
@@ -139,8 +143,8 @@ def match_large(
     matcher = Matcher(method, **options)
     limit = None if memory is None else parse_memory(memory)
     sources = open_source("left", left), open_source("right", right)
-    _check_pair(*sources)
-    tone = find_tone(*sources)
+    check_same(*sources)
+    tone = tone_of(*sources, matcher.settings.nodata)
     height, width = sources[0].shape[:2]
     windows = _plan(matcher, sources, tone, overlap, limit, target)
     ranges: Ranges | None = None
@@ -153,19 +157,13 @@ def match_large(
     return LargeResult(target, height, width, windows.window, total, overlap, density, matcher)
 
 
-def _check_pair(left: Source, right: Source) -> None:
-    if left.dtype != right.dtype:
-        raise InputError(f"left and right must have the same type, got {left.dtype} and {right.dtype}")
-    if left.shape[:2] != right.shape[:2]:
-        raise InputError(f"left and right must have the same size, got {left.shape[:2]} and {right.shape[:2]}")
-
-
 def _plan(
     matcher: Matcher, sources: tuple[Source, Source], tone: Tone, overlap: int, limit: int | None, target: Path
 ) -> Plan:
     height, width = sources[0].shape[:2]
     size = tone.kind.itemsize
-    pixel = 2 * size + (size > 1) + 2 * (sources[0].dtype.kind == "f") + 5  # both images, guide, masks, the map
+    masked = tone.nodata is not None or sources[0].dtype != np.uint8 or any(s.shape[2:] == (4,) for s in sources)
+    pixel = 2 * size + (size > 1) + 2 * masked + 5  # both images, guide, masks, the map
     pixel += getattr(matcher.cost, "bytes_per_pixel", 0)
     pixel += _refiner_nbytes(matcher)
     band = 4 * width * (2 if target.suffix.lower() == ".npy" else 4)  # before and after the median, and as tiles

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import OptionError, shown
-from stereokit.images.gray import check_integer
+from stereokit.images.check import check_integer
 from stereokit.images.maps import checked_map
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, load, maximum, minimum, store

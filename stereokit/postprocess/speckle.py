@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.images.gray import check_integer, check_number
+from stereokit.images.check import check_integer, check_number
 from stereokit.images.maps import check_threads, checked_map
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.threads import run, spans

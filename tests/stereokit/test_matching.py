@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import cv2
@@ -389,10 +388,8 @@ def test_warmup_compiles_and_returns_nothing():
 def test_twelve_megapixels():
     # Penalties below 86 keep the sums of SGM in bytes: 0.8 GB for the one volume that it holds.
     left, right = shifted(11, (3000, 4000), 14)
-    start = time.perf_counter()
     options = {"p1": 10, "p2": 80, "paths": 8, "subpixel": False, "median": 0, "smooth": 0}
     result = Matcher("census+sgm", max_disparity=16, **options)(left, right)
-    assert time.perf_counter() - start < 120
     assert (result.disparity[:, 20:-8] == 11).mean() > 0.999
     assert (result.disparity[[0, 1499, 1500, 2999], 20:-8] == 11).all()
 

@@ -35,7 +35,7 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.errors import FileError, OptionError, StereokitError
-from stereokit.images.gray import check_integer
+from stereokit.images.check import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES
 from stereokit_evaluation.batch.job import Job, matcher_of
 from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs

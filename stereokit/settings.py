@@ -118,7 +118,7 @@ class MatchSettings:
         if isinstance(self.fill, str) and self.fill == "none":
             put("fill", None)
         if self.fill is not None and (not isinstance(self.fill, str) or self.fill not in FILLS):
-            raise UnknownNameError(did_you_mean("fill", str(self.fill), (*FILLS, "none")))
+            raise UnknownNameError(did_you_mean("fill", self.fill, (*FILLS, "none")))
         put("median", check_integer("median", self.median))
         if self.median not in (0, 3, 5):
             raise OptionError(f"median must be 0, 3 or 5, got {self.median}")

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import FileError, InputError, OptionError
-from stereokit.images.gray import to_gray
+from stereokit.images.intensity import to_gray
 
 __all__ = [
     "DISPARITY_SUFFIXES",

@@ -8,7 +8,9 @@ import pytest
 
 import stereokit
 from stereokit import InputError, Matcher, OptionError, StereokitError, UnknownNameError, match
-from stereokit.images.gray import gray_pair, half_size, smooth, to_gray
+from stereokit.images.gray import gray_pair
+from stereokit.images.intensity import to_gray
+from stereokit.images.resize import half_size, smooth
 
 METHOD = "census+sgm"
 KEEP_ALL = {"fill": None, "smp": False, "speckle": 0, "uniqueness": 0, "median": 0}
@@ -246,20 +248,21 @@ A = np.zeros((4, 5), np.uint8)
     [
         (A[0], A, ["left", "(5,)"]),
         (A, A[None, None], ["right", "(1, 1, 4, 5)"]),
-        (np.zeros((4, 5, 4), np.uint8), A, ["left", "(4, 5, 4)"]),
+        (np.zeros((4, 5, 5), np.uint8), A, ["left", "(4, 5, 5)"]),
         (np.zeros((4, 5, 2), np.uint8), A, ["left", "(4, 5, 2)"]),
         (A[:0], A[:0], ["left", "empty", "(0, 5)"]),
         (A, A[:, :0], ["right", "empty", "(4, 0)"]),
         (np.zeros((0, 5, 3), np.uint8), A, ["left", "empty"]),
         (A, A[:3], ["same size", "(4, 5)", "(3, 5)"]),
         (A, A.astype(np.float32), ["same type", "uint8", "float32"]),
-        (A.astype(np.int32), A, ["left", "int32", "uint8"]),
-        (A, A.astype(np.float16), ["right", "float16"]),
-        (A.astype(bool), A, ["left", "bool"]),
+        (A.astype(np.int32), A, ["same type", "int32", "uint8"]),
+        (A, A.astype(np.float16), ["same type", "uint8", "float16"]),
         (A.astype(complex), A, ["left", "complex"]),
+        (A, A.astype("M8[s]"), ["right", "datetime64"]),
         (A.astype(object), A, ["left", "object"]),
-        ("left.png", A, ["left", "uint8"]),
-        (None, A, ["left"]),
+        ("left.png", A, ["left", "numbers", "<U8"]),
+        (None, A, ["left", "None", "was the file read?"]),
+        (A, None, ["right", "None", "was the file read?"]),
         ([[1, 2], [3]], A, ["left"]),
     ],
 )
@@ -297,6 +300,8 @@ BAD_OPTIONS = [
     ({"median": "wide"}, ["median", "wide"]),
     ({"outside": 1.5}, ["outside", "1.5"]),
     ({"outside": float("nan")}, ["outside", "nan"]),
+    ({"nodata": "none"}, ["nodata", "number", "none"]),
+    ({"nodata": True}, ["nodata", "True"]),
     ({"smooth": -1}, ["smooth", "0 to 10", "-1"]),
     ({"smooth": None}, ["smooth", "None"]),
     ({"uniqueness": 101}, ["uniqueness", "0 to 100", "101"]),

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import stereokit
-from stereokit.cli.app import app
+from stereokit.cli import app
 from stereokit.errors import FileError, InputError, OptionError, StereokitError
 from stereokit.large import matching, memory
 from stereokit.large.output import write_bands
@@ -47,6 +47,15 @@ def cut(monkeypatch):
     return limit
 
 
+def marked(pair, value, hot=False):
+    """Return copies of a pair with a band of `value` each and, if asked for, some outliers of different values."""
+    left, right = pair[0].copy(), pair[1].copy()
+    left[:, 20:26], right[60:64] = value, value
+    if hot:
+        left[::20, ::20] = np.arange(32).reshape(4, 8) * 1000 + 9000
+    return left, right
+
+
 def kinds():
     left, right = textured(70, 160)
     rgb = textured(70, 160, channels=3)
@@ -70,6 +79,13 @@ def kinds():
         "float rgb": (rgb[0] / np.float64(91), rgb[1] / np.float64(91)),
         "floats with holes": holes,
         "whole floats with holes": whole_holes,
+        "floats with a mark": marked(real, -9999),
+        "uint16 with a mark and outliers": marked(wide, 65535, hot=True),
+        "floats with outliers": marked(real, 300.0, hot=True),
+        "int16 with a mark": marked((left.astype(np.int16), right.astype(np.int16)), -32768),
+        "rows without evidence": (np.where(np.arange(70)[:, None] == 9, np.nan, real[0] + 1000), real[1] + 1000.0),
+        "rgba": tuple(np.dstack([image, 255 * (image[..., :1] > 40)]) for image in rgb),
+        "float16": (real[0].astype(np.float16), real[1].astype(np.float16)),
         "blank": (np.full((40, 50), 0.5), np.full((40, 50), 0.5)),
     }
 
@@ -83,12 +99,21 @@ def test_one_window_gives_the_map_of_match(kind, method, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), expected)
 
 
-@pytest.mark.parametrize("kind", ["grey", "uint16", "floats"])
+def test_nodata_is_that_of_match(tmp_path):
+    left, right = textured(70, 160)
+    left[:, 20:26] = 0
+    stereokit.match_large(left, right, tmp_path / "out.npy", "S2", max_disparity=16, nodata=0, fill=None)
+    expected = stereokit.match(left, right, "S2", max_disparity=16, nodata=0, fill=None)
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), expected)
+    assert np.isnan(expected[:, 20:26]).all()
+
+
+@pytest.mark.parametrize("kind", ["grey", "uint16", "floats", "floats with a mark", "floats with outliers"])
 def test_windows_decide_what_whole_images_decide(kind, tmp_path, cut):
     """The domain transform forgets within the margin: strips must give the same map, bit for bit, for any type."""
     left, right = kinds()[kind]
     left, right = (np.vstack([image] * 4) for image in (left, right))
-    left[:, :9] //= 3 if kind != "floats" else 1  # ranges of windows differ
+    left[:, :9] //= 1 if kind.startswith("floats") else 3  # ranges of windows differ
     cut(220 * 160)
     for method in ("S1", "S3"):
         result = stereokit.match_large(left, right, tmp_path / "out.npy", method, max_disparity=16, overlap=80)

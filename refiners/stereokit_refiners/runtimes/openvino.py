@@ -20,7 +20,6 @@ the maps are as good: on generated streets the mean error is within a hundredth 
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
@@ -31,6 +30,7 @@ from numpy.typing import NDArray
 from openvino import opset13 as op
 
 from stereokit.kernels.threads import available_threads
+from stereokit.kernels.workspace import Pool
 from stereokit_refiners.networks.layers import Layer, Network, Weights, sub_pixel_kernel
 
 __all__ = ["build", "compiled"]
@@ -191,20 +191,17 @@ def compiled(
             "ENABLE_CPU_PINNING": False,
         },
     )
-    idle: deque[Any] = deque()
-    made = threading.Lock()
+    lock = threading.Lock()
+
+    def request() -> Any:
+        with lock:
+            return model.create_infer_request()
+
+    requests: Pool[Any] = Pool(request)
 
     def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        try:
-            request = idle.pop()
-        except IndexError:
-            with made:
-                request = model.create_infer_request()
-        try:
-            given = [inputs[name][None] for name in network.inputs]
-            request.infer(given, share_inputs=True)
-            return np.array(request.get_output_tensor().data[0])
-        finally:
-            idle.append(request)
+        with requests.take() as free:
+            free.infer([inputs[name][None] for name in network.inputs], share_inputs=True)
+            return np.array(free.get_output_tensor().data[0])
 
     return run

@@ -69,7 +69,7 @@ class _PlainOps:
         return a + b
 
     def shift(self, x: Array, by: float) -> Array:
-        return x + np.float32(by)
+        return np.asarray(x + np.float32(by), np.float32)
 
     def activate(self, name: str, x: Array) -> Array:
         return np.asarray(np.where(x < 0, x * np.float32(0.1), x), np.float32)

@@ -2,7 +2,9 @@
 
 The runtime is whatever is installed: OpenVINO first, then ONNX Runtime, then torch; and the precision what the
 processor is fast at: int8 where it has the instructions and the weights were calibrated, else bfloat16, else fp32.
-Networks compiled for a size are kept, a few at a time.
+Before a process trusts a runtime with a network, it compares a small map with that of plain numpy
+(`stereokit_refiners.runtimes.reference`), and takes another runtime, with a warning, if they disagree. Networks
+compiled for a size are kept, a few at a time.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,6 +29,7 @@ from stereokit_refiners.contract import on_tensors
 from stereokit_refiners.linear import doubled
 from stereokit_refiners.runtimes.compose import compose
 from stereokit_refiners.runtimes.encode import encode
+from stereokit_refiners.runtimes.reference import SCENE_SIZE, TOLERANCES_PX, mistake
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
 
 if TYPE_CHECKING:
@@ -116,7 +120,7 @@ class LearnedRefiner:
     @property
     def fingerprint(self) -> str:
         """What the result depends on, beside the inputs."""
-        return f"{self._file.fingerprint}-{self.backend}-{self.precision}"
+        return f"{self._file.fingerprint}-{self._compiled.backend}-{self._compiled.precision}"
 
     @property
     def trained_on(self) -> frozenset[str]:
@@ -206,15 +210,24 @@ def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArra
     return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
 
 
-def _backend(name: str) -> str:
-    if name != "auto" and name not in BACKENDS:
-        raise OptionError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
+def _installed() -> list[str]:
+    """Return the runtimes that are there, the best first."""
     there = [b for b in BACKENDS if importlib.util.find_spec(b) is not None]
     if "onnxruntime" in there and importlib.util.find_spec("onnx") is None:
         there.remove("onnxruntime")
+    return there
+
+
+def _backend(name: str) -> str:
+    if name != "auto" and name not in BACKENDS:
+        raise OptionError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
+    there = _installed()
     if name == "auto":
         if not there:
-            raise StereokitError("learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[fast]'")
+            raise StereokitError(
+                "learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[fast]', or "
+                "'stereokit[onnx]' where OpenVINO has no wheel"
+            )
         return there[0]
     if name not in there:
         extra = {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}[name]
@@ -241,8 +254,59 @@ def _precision(name: str, backend: str, content: WeightFile) -> str:
     return "bf16" if features.get("avx512bf16") or features.get("amx-bf16") else "fp32"
 
 
+_sound: dict[tuple[str, str, str], tuple[str, str]] = {}
+_sound_lock = threading.Lock()
+
+
+def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, str]:
+    """Return the backend and precision to run a network with: those given, if they compute it rightly here.
+
+    Checked once a process for each network, with the weights that come first.
+
+    Raises
+    ------
+    StereokitError
+        If no runtime that is installed does.
+    """
+    key = content.network, backend, precision
+    with _sound_lock:
+        if key not in _sound:
+            wrong = []
+            ways = [(backend, precision), *((b, "fp32") for b in _installed() if (b, "fp32") != (backend, precision))]
+            for way in ways:
+                off = mistake(content, _compile(content, *way, *SCENE_SIZE, 1))
+                if off <= TOLERANCES_PX[way[1]]:
+                    break
+                wrong.append(f"{way[0]} in {way[1]} is off by {off:.3g} px on average")
+            else:
+                told = "; ".join(wrong)
+                raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {told}")
+            if wrong:
+                told = f"since on this machine {'; '.join(wrong)}"
+                told = f"network {content.network!r} is run by {way[0]} in {way[1]}, {told}"
+                warnings.warn(told, RuntimeWarning, stacklevel=5)
+            _sound[key] = way
+        return _sound[key]
+
+
+def _compile(content: WeightFile, backend: str, precision: str, rows: int, columns: int, threads: int) -> Run:
+    network = network_named(content.network)
+    if backend == "openvino":
+        from stereokit_refiners.runtimes.openvino import compiled
+
+        ranges = content.ranges if precision == "int8" else None
+        return compiled(network, content.arrays, rows, columns, threads, precision, ranges)
+    if backend == "onnxruntime":
+        from stereokit_refiners.runtimes.onnx import session
+
+        return session(network, content.arrays, threads)
+    from stereokit_refiners.runtimes.torch import runner
+
+    return runner(network, content.arrays)
+
+
 class _Compiled:
-    """The compiled networks of one refiner, by size and threads."""
+    """The compiled networks of one refiner, by size and threads; `backend` and `precision` are what runs them."""
 
     def __init__(self, content: WeightFile, backend: str, precision: str) -> None:
         self.content, self.backend, self.precision = content, backend, precision
@@ -254,23 +318,12 @@ class _Compiled:
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)
         with self._lock:
-            runner = self._held.pop(key, None) or self._compile(rows, columns, threads)
+            if not self._held:
+                self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
+            runner = self._held.pop(key, None) or _compile(
+                self.content, self.backend, self.precision, rows, columns, threads
+            )
             self._held[key] = runner
             while len(self._held) > _KEPT:
                 self._held.popitem(last=False)
         return runner(inputs)
-
-    def _compile(self, rows: int, columns: int, threads: int) -> Run:
-        network = network_named(self.content.network)
-        if self.backend == "openvino":
-            from stereokit_refiners.runtimes.openvino import compiled
-
-            ranges = self.content.ranges if self.precision == "int8" else None
-            return compiled(network, self.content.arrays, rows, columns, threads, self.precision, ranges)
-        if self.backend == "onnxruntime":
-            from stereokit_refiners.runtimes.onnx import session
-
-            return session(network, self.content.arrays, threads)
-        from stereokit_refiners.runtimes.torch import runner
-
-        return runner(network, self.content.arrays)

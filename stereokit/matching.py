@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Levels, Pair, takes_8_bits
-from stereokit.cuda.driver import has_device, require_device
+from stereokit.cuda.driver import require_device
 from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.images.check import check_flag, check_integer, check_names, check_nodata, check_number
@@ -70,8 +70,9 @@ class Matcher:
         For ``scale=0.5``: the name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
         `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
     device : {"auto", "cpu", "cuda"}
-        Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``; "auto" takes it
-        where it can be used, else the CPU. Refiners run on the CPU, but for `on_device`.
+        Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``. "auto" is the CPU
+        for now, with a GPU too: the kernels are tested in an interpreter and have not run on a GPU yet. Refiners run
+        on the CPU, but for `on_device`.
     threads : int or None
         Threads of one call; None uses the processors at hand. The result does not depend on it.
     fill : {"background", "nearest"} or None
@@ -136,18 +137,14 @@ class Matcher:
         self._pool = Pool()
         self.device = "cpu"
         self._cuda: CudaPipeline | None = None
-        if device == "cuda" or (device == "auto" and has_device()):
-            self._set_device(fall_back=device == "auto")
+        if device == "cuda":  # "auto" is the CPU until the kernels have run on a GPU
+            self._set_device()
 
-    def _set_device(self, fall_back: bool) -> None:
+    def _set_device(self) -> None:
         from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
 
-        try:
-            self._cuda = CudaPipeline(self._cuda_settings(), getattr(self._refine, "on_device", None))
-            self.device = "cuda"
-        except DeviceError:
-            if not fall_back:
-                raise
+        self._cuda = CudaPipeline(self._cuda_settings(), getattr(self._refine, "on_device", None))
+        self.device = "cuda"
 
     def _cuda_settings(self) -> Settings:
         """Return what `stereokit.cuda.pipeline` needs to know."""
@@ -204,7 +201,7 @@ class Matcher:
         self._cuda = None
         if self.device == "cuda":
             require_device()
-            self._set_device(fall_back=False)
+            self._set_device()
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
@@ -255,7 +252,7 @@ class Matcher:
         Disparity
             Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, if asked for,
             ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
-            a filled map is `min_disparity` everywhere; learned refiners may add a pixel or two.
+            a filled map is `min_disparity` everywhere.
 
         Raises
         ------

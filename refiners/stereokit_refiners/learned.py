@@ -165,7 +165,7 @@ class LearnedRefiner:
         below, beside = -height % network.multiple, -width % network.multiple
         candidates = coarse.candidates if self.needs_candidates else None
         given = [disparity] if candidates is None else [disparity, candidates]
-        shift = base_of(given)
+        shift = base_of(given)  # whole, so that float32 holds it
         self._check_trained(disparity, shift)
         disparity = _extended((disparity - shift) * np.float32(2), below, beside)
         confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
@@ -185,7 +185,7 @@ class LearnedRefiner:
         sure = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
-    def _check_trained(self, disparity: NDArray[np.float32], shift: np.float32) -> None:
+    def _check_trained(self, disparity: NDArray[np.float32], shift: float) -> None:
         """Warn, once, where a map in half-size pixels, lowered by `shift`, goes beyond what was trained."""
         low, high = self.trained_disparities
         share = np.count_nonzero(disparity - shift > high / 2) / disparity.size

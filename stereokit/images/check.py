@@ -103,8 +103,9 @@ def accepted_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:
 
     Whole numbers become floats that hold them: what those are in grey is decided by their values, not by their type.
     """
-    if dtype.newbyteorder("=") in _TYPES:
-        return dtype.newbyteorder("=")
+    native: np.dtype[Any] = dtype.newbyteorder("=")
+    if native in _TYPES:
+        return native
     if dtype.kind == "b":
         return np.dtype(np.uint8)
     if dtype.kind in "iuf" and dtype.itemsize <= 8:

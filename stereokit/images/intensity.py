@@ -201,7 +201,7 @@ def display_8bit(image: Any, nodata: float | None = None) -> NDArray[np.uint8]:
         warnings.simplefilter("ignore", StereokitWarning)
         tone = find_tone(lambda: [(0, plane)], plane.dtype, plane.shape, nodata)
     gray, unknown = tone.apply(plane)
-    shown = tone.guide(gray).reshape(colors.shape).copy()
+    shown: NDArray[np.uint8] = tone.guide(gray).reshape(colors.shape).copy()
     if unknown is not None:
         shown.reshape(plane.shape)[unknown] = 0
     if missing is not None:

@@ -13,10 +13,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.images.intensity import Tone
 from stereokit.kernels.workspace import Workspace
 from stereokit.large.plan import Cut, Plan
 from stereokit.large.sources import Source
-from stereokit.large.tones import Ranges, Tone, read_pair
+from stereokit.large.tones import Ranges, read_pair
 from stereokit.matching import Matcher
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows

@@ -32,7 +32,7 @@ def check_form(form: str, known: tuple[str, ...] = FORMS, network: str = "") -> 
     return form
 
 
-def base_of(maps: Sequence[NDArray[np.float32]]) -> np.float32:
+def base_of(maps: Sequence[NDArray[np.float32]]) -> float:
     """Return what a network's maps are lowered by, whole half-size pixels, so that they begin as those of the training.
 
     Parameters
@@ -42,20 +42,20 @@ def base_of(maps: Sequence[NDArray[np.float32]]) -> np.float32:
 
     Returns
     -------
-    float32
+    float
         Below zero, where a map goes below: its lowest value. Above zero, where the coarse map begins above
         `BEGINNING`: by as much. It begins where a hundredth of its pixels lies below, but for the columns at the left
         that lie outside the right view at the map's median: what stands there was not measured.
     """
     lowest = min(np.floor(one.min()) for one in maps)
     if lowest < 0:
-        return np.float32(lowest)
+        return float(lowest)
     values = maps[0]
     middle = np.partition(values, (values.size - 1) // 2, axis=None)[(values.size - 1) // 2]
     columns = np.arange(values.shape[1])
     seen = np.where(columns >= min(middle, values.shape[1] // 2), values, np.inf)
     first = np.partition(seen, values.size // 100, axis=None)[values.size // 100]
-    return np.float32(max(0.0, np.floor(first - BEGINNING)))
+    return max(0.0, float(np.floor(first - BEGINNING)))
 
 
 def half_image(left: NDArray[Any]) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stereokit.aggregation.contract import Aggregation
 from stereokit.costs.rows import Cost
-from stereokit.cuda.driver import has_device, require_device
+from stereokit.cuda.driver import require_device
 from stereokit.defaults import METHODS
 from stereokit.errors import DeviceError, InputError, OptionError, shown
 from stereokit.images.check import check_integer
@@ -51,8 +51,9 @@ class Matcher:
         For ``scale=0.5``: the name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
         `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
     device : {"auto", "cpu", "cuda"}
-        Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``; "auto" takes it
-        where it can be used, else the CPU. Refiners run on the CPU, but for `on_device`.
+        Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``. "auto" is the CPU
+        for now, with a GPU too: the kernels are tested in an interpreter and have not run on a GPU yet. Refiners run
+        on the CPU, but for `on_device`.
     threads : int or None
         Threads of one call; None uses the processors at hand. The result does not depend on it.
     fill : {"background", "nearest"} or None
@@ -233,7 +234,7 @@ class Matcher:
         Disparity
             Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, if asked for,
             ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
-            a filled map is `min_disparity` everywhere; learned refiners may add a pixel or two.
+            a filled map is `min_disparity` everywhere.
 
         Raises
         ------
@@ -321,16 +322,12 @@ class Matcher:
 
 
 def _pipeline(settings: MatchSettings, device: str) -> Pipeline:
-    """Return the way through the GPU where it is asked for and can be had, else the one through the CPU."""
-    if device == "cuda" or (device == "auto" and has_device()):
-        from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
+    """Return the way through the CPU or the GPU; "auto" is the CPU until the kernels have run on a GPU."""
+    if device != "cuda":
+        return CpuPipeline(settings)
+    from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
 
-        try:
-            return CudaPipeline(settings)
-        except DeviceError:
-            if device == "cuda":
-                raise
-    return CpuPipeline(settings)
+    return CudaPipeline(settings)
 
 
 def _mirror(pair: GrayPair) -> GrayPair:

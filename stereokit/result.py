@@ -64,6 +64,27 @@ class Disparity:
         if self.candidates is not None:
             _check("candidates", self.candidates, np.float32, (2, *shape))
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return `disparity` where numpy asks for an array: ``np.asarray(result)`` is the map, without a copy."""
+        if copy is None:
+            return np.asarray(self.disparity, dtype)
+        if copy:
+            return np.array(self.disparity, dtype)
+        if dtype is not None and np.dtype(dtype) != self.disparity.dtype:
+            raise ValueError(
+                f"a disparity map of {self.disparity.dtype} cannot become {np.dtype(dtype)} without a copy"
+            )
+        return self.disparity
+
+    def __repr__(self) -> str:
+        height, width = self.disparity.shape
+        known = self.disparity[np.isfinite(self.disparity)]
+        span = f"{known.min():.1f} .. {known.max():.1f} px" if known.size else "no disparity"
+        more = [name for name in ("confidence", "right", "candidates") if getattr(self, name) is not None]
+        return (
+            f"Disparity({height}x{width}, {span}, {100 * self.density:.1f} % measured{''.join(f', {m}' for m in more)})"
+        )
+
     @property
     def density(self) -> float:
         """The share of pixels that were measured, from 0 to 1."""

@@ -22,13 +22,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import OptionError, StereokitError
+from stereokit.errors import OptionError, StereokitError, StereokitWarning
 from stereokit.postprocess import fill
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
 from stereokit_refiners.linear import doubled
 from stereokit_refiners.runtimes.compose import compose
-from stereokit_refiners.runtimes.encode import encode
+from stereokit_refiners.runtimes.encode import base_of, encode
 from stereokit_refiners.runtimes.reference import SCENE_SIZE, TOLERANCES_PX, mistake
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
 
@@ -40,6 +40,7 @@ __all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRef
 BACKENDS = ("openvino", "onnxruntime", "torch")
 PRECISIONS = ("fp32", "bf16", "int8")
 _KEPT = 4  # compiled networks
+_FEW = 0.01  # of the pixels may lie beyond the disparities of the training
 
 Run = Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]
 """From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
@@ -128,6 +129,11 @@ class LearnedRefiner:
         return frozenset(str(name) for name in self._file.notes.get("frames", ()))
 
     @property
+    def trained_disparities(self) -> tuple[float, float]:
+        """The smallest and the largest disparity of the training, full-size pixels, as the weight file says."""
+        return self._file.disparities
+
+    @property
     def needs_confidence(self) -> bool:
         """Whether the coarse map must come with the matcher's confidence."""
         return "confidence" in network_named(self._file.network).inputs
@@ -141,7 +147,14 @@ class LearnedRefiner:
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
 
         Where the coarse map is NaN, the result is; the network sees it filled. Networks know disparities from 0 on:
-        one whose map goes below sees it lifted by as much.
+        one whose map goes below sees it lifted by as much, one whose map begins far above sees it lowered (see
+        `stereokit_refiners.runtimes.encode.base_of`). No disparity lies beyond the smallest and the largest that the
+        matcher has found.
+
+        Warns
+        -----
+        StereokitWarning
+            Once, if disparities beyond those of the training remain.
         """
         network = network_named(self._file.network)
         rows, columns = left.shape
@@ -155,7 +168,9 @@ class LearnedRefiner:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
         below, beside = -height % network.multiple, -width % network.multiple
         candidates = coarse.candidates if self.needs_candidates else None
-        shift = np.float32(min(0.0, *(np.floor(a.min()) for a in (disparity, candidates) if a is not None)))
+        given = [disparity] if candidates is None else [disparity, candidates]
+        shift = base_of(given)  # whole, so that float32 holds it
+        self._check_trained(disparity, shift)
         disparity = _extended((disparity - shift) * np.float32(2), below, beside)
         confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
         image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
@@ -163,8 +178,9 @@ class LearnedRefiner:
         inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
         head = self._compiled.run(inputs, threads)
         full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
-        if shift < 0:
+        if shift != 0:
             full += 2 * shift
+        np.clip(full, 2 * min(a.min() for a in given), 2 * max(a.max() for a in given), out=full)
         known = doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
         if gaps:
             missing = doubled(unknown.view(np.uint8), rows, columns).astype(bool)
@@ -172,6 +188,21 @@ class LearnedRefiner:
             known &= ~missing
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
+
+    def _check_trained(self, disparity: NDArray[np.float32], shift: float) -> None:
+        """Warn, once, where a map in half-size pixels, lowered by `shift`, goes beyond what was trained."""
+        low, high = self.trained_disparities
+        share = np.count_nonzero(disparity - shift > high / 2) / disparity.size
+        if share > _FEW and not self._compiled.warned:
+            self._compiled.warned = True
+            lowered = f", {2 * shift:g} px taken off" if shift > 0 else ""
+            warnings.warn(
+                f"refiner {self._file.network!r} was trained on disparities from {low:g} to {high:g} px, "
+                f"{100 * share:.0f} % of this map lie beyond{lowered}: they come out 1 to 2 % too small; "
+                "refiner 'linear' takes any",
+                StereokitWarning,
+                stacklevel=3,
+            )
 
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
@@ -312,6 +343,7 @@ class _Compiled:
         self.content, self.backend, self.precision = content, backend, precision
         self._held: OrderedDict[tuple[int, int, int], Run] = OrderedDict()
         self._lock = threading.Lock()
+        self.warned = False
 
     def run(self, inputs: dict[str, NDArray[np.float32]], threads: int) -> NDArray[np.float32]:
         """Return the head for encoded inputs."""

@@ -30,6 +30,7 @@ NETWORKS: dict[str, Network] = {network.name: network for network in (StereoVae(
 """Architectures by name."""
 
 _FORMAT = "stereokit-refiner/2"
+_DISPARITIES = (0.0, 128.0)  # of the training of files that do not say
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class WeightFile:
     ranges : dict of lists of float
         Largest absolute value of each channel of each activation, for int8; empty when it was not calibrated.
     notes : dict
-        How it was trained: free, JSON.
+        How it was trained: free, JSON. ``"disparities"`` are the smallest and the largest of the training, pixels.
     """
 
     network: str
@@ -53,6 +54,12 @@ class WeightFile:
     arrays: Mapping[str, NDArray[np.float32]]
     ranges: Mapping[str, list[float]] = field(default_factory=dict)
     notes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def disparities(self) -> tuple[float, float]:
+        """The smallest and the largest disparity of the training, full-size pixels."""
+        low, high = self.notes.get("disparities", _DISPARITIES)
+        return float(low), float(high)
 
     @property
     def fingerprint(self) -> str:
@@ -134,6 +141,7 @@ def read(path: str | Path) -> WeightFile:
     except (ValueError, TypeError, AttributeError):
         raise FileError(f"weights must hold ranges and notes as JSON, got something else in {text!r}") from None
     _check(text, name, form, arrays, ranges)
+    _check_disparities(text, notes)
     return WeightFile(name, form, arrays, ranges, notes)
 
 
@@ -149,6 +157,14 @@ def shipped(name: str) -> WeightFile:
     if not path.is_file():
         raise FileError(f"no weights for {name!r} come with this version")
     return read(str(path))
+
+
+def _check_disparities(path: str, notes: Mapping[str, Any]) -> None:
+    """Raise FileError unless the disparities of the training, if the notes have them, are two numbers in order."""
+    given = notes.get("disparities", _DISPARITIES)
+    numbers = isinstance(given, (list, tuple)) and len(given) == 2 and all(type(x) in (int, float) for x in given)
+    if not numbers or not -math.inf < given[0] < given[1] < math.inf:
+        raise FileError(f"disparities in notes must be two numbers, the smaller first, got {given!r} in {path!r}")
 
 
 def _check(

@@ -103,3 +103,28 @@ def test_inputs_stay_as_they_are():
     kept = strided.copy()
     colorize(strided)
     np.testing.assert_array_equal(strided, kept)
+
+
+def test_numpy_takes_a_result_as_its_map():
+    disparity = np.array([[1.5, np.nan], [40.25, 3]], np.float32)
+    result = Disparity(disparity, np.isfinite(disparity))
+    assert np.asarray(result) is disparity
+    np.testing.assert_array_equal(np.array(result), disparity)
+    assert not np.shares_memory(np.array(result), disparity)
+    assert np.asarray(result, np.float64).dtype == np.float64
+    assert np.nanmax(result) == 40.25
+    np.testing.assert_array_equal(np.stack([result, result])[1], disparity)
+    if np.lib.NumpyVersion(np.__version__) >= "2.0.0":
+        assert np.asarray(result, copy=False) is disparity
+        with pytest.raises(ValueError, match="without a copy"):
+            np.asarray(result, dtype=np.float64, copy=False)
+    assert result.__array__(np.float32, copy=False) is disparity
+    assert not np.shares_memory(result.__array__(copy=True), disparity)
+
+
+def test_a_result_is_told_in_one_line():
+    disparity = np.array([[1.5, np.nan], [40.25, 3]], np.float32)
+    result = Disparity(disparity, np.isfinite(disparity), confidence=np.zeros((2, 2), np.float32))
+    assert repr(result) == "Disparity(2x2, 1.5 .. 40.2 px, 75.0 % measured, confidence)"
+    nothing = Disparity(np.full((1, 3), np.nan, np.float32), np.zeros((1, 3), bool))
+    assert repr(nothing) == "Disparity(1x3, no disparity, 0.0 % measured)"

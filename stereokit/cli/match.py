@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from stereokit.cli.options import (
     DeviceOption,
@@ -25,7 +24,7 @@ from stereokit.cli.options import (
     described,
     parse_settings,
 )
-from stereokit.cli.output import report, version_of, waiting
+from stereokit.cli.output import Table, report, version_of, waiting
 from stereokit.errors import InputError, OptionError
 
 if TYPE_CHECKING:
@@ -177,9 +176,7 @@ def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height
         return None
     from stereokit.calibration import read_calibration
 
-    camera = read_calibration(path, cameras)
-    camera.check_size(width, height)
-    return camera
+    return read_calibration(path, cameras, (width, height))
 
 
 def _present(array: NDArray[Any] | None, option: str, method: str) -> NDArray[Any]:

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import FileError, InputError, OptionError
-from stereokit.io.atomic import read_bytes, write_bytes
+from stereokit.io.atomic import write_bytes
 from stereokit.io.images import decode, describe, encode
 from stereokit.io.pfm import pfm_bytes, read_pfm
+from stereokit.io.reading import parsing, read_bytes, read_npy
 
 __all__ = [
     "DISPARITY_SUFFIXES",
@@ -51,9 +52,13 @@ def read_disparity(path: str | os.PathLike[str]) -> NDArray[np.float32]:
     FileError
         If the file is missing, has another suffix or does not hold such a map.
     """
-    suffix = _suffix(path)
+    with parsing(path, "disparity map"):
+        return _read(path, _suffix(path))
+
+
+def _read(path: str | os.PathLike[str], suffix: str) -> NDArray[np.float32]:
     if suffix == ".png":
-        stored = decode(path)
+        stored, _ = decode(path)
         if stored.dtype != np.uint16 or stored.ndim != 2:
             raise FileError(f"{str(path)!r} must be a 16-bit grey PNG, got {describe(stored)}")
         disparity: NDArray[np.float32] = stored.astype(np.float32) / np.float32(256)
@@ -62,12 +67,9 @@ def read_disparity(path: str | os.PathLike[str]) -> NDArray[np.float32]:
     if suffix == ".pfm":
         array: NDArray[Any] = read_pfm(path)
     elif suffix == ".npy":
-        try:
-            array = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise FileError(f"{str(path)!r} is not a readable npy file") from error
+        array = read_npy(path, read_bytes(path))
     else:
-        array = decode(path)
+        array, _ = decode(path)
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu":
         raise FileError(f"{str(path)!r} must hold a 2-d array of numbers, got {describe(array)}")
     disparity = array.astype(np.float32)

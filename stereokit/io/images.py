@@ -1,7 +1,9 @@
-"""Images as OpenCV reads and writes them."""
+"""Images: read by content, whatever the suffix says, as viewers show them; written by suffix."""
 
 from __future__ import annotations
 
+import io
+import logging
 import os
 from typing import Any
 
@@ -10,62 +12,100 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import FileError, InputError
-from stereokit.io.atomic import check_output, read_bytes, write_bytes
+from stereokit.io.atomic import check_output, write_bytes
+from stereokit.io.orientation import UPRIGHT, find_orientation, oriented, without_orientation
+from stereokit.io.quiet import quiet_decoders
+from stereokit.io.reading import parsing, read_bytes, read_npy
+from stereokit.notices import PairWarning, warn
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "READABLE_SUFFIXES",
     "decode",
     "describe",
     "encode",
+    "open_tiff",
     "read_image",
+    "read_pair",
     "write_image",
 ]
 
 IMAGE_SUFFIXES = (".png", ".tiff", ".tif", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm")
 """What `write_image` knows."""
 
+READABLE_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".jp2", ".avif", ".gif", ".pnm", ".pbm", ".npy")
+"""What is taken for an image where files are looked for by name. `read_image` itself goes by the content."""
+
 _DEEP = {
     "uint16": (".png", ".tiff", ".tif", ".pgm", ".ppm"),
     "float32": (".tiff", ".tif"),
     "float64": (".tiff", ".tif"),
 }
+_NPY = b"\x93NUMPY"
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it then raises
 
 
 def read_image(path: str | os.PathLike[str], gray: bool = False) -> NDArray[Any]:
-    """Read an image as it is stored.
+    """Read an image as viewers show it.
 
     Parameters
     ----------
     path : path
-        Anything that OpenCV decodes: PNG, JPEG, TIFF, BMP, PGM, PPM ...
+        Anything that OpenCV decodes (PNG, JPEG, TIFF, BMP, PGM, PPM, WebP ...), npy, and TIFF of other compressions
+        with ``stereokit[large]``.
     gray : bool
         Turn colour into grey (0.299 R + 0.587 G + 0.114 B).
 
     Returns
     -------
     (H, W) or (H, W, 3) uint8, uint16, float32 or float64
-        Grey or RGB. Alpha is dropped, palettes are resolved, rotation tags are not applied.
+        Grey or RGB. Alpha is dropped, palettes are resolved, orientation tags are applied.
 
     Raises
     ------
     FileError
         If the file is missing or is not an image of these types.
     """
-    image = decode(path)
+    return _read(path, gray)[0]
+
+
+def read_pair(
+    left: str | os.PathLike[str], right: str | os.PathLike[str], gray: bool = False
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Read the two images of a pair, as `read_image`; warn where their orientation tags differ.
+
+    Raises
+    ------
+    FileError
+        If a file is missing or is not an image.
+    """
+    images, tags = zip(*(_read(path, gray) for path in (left, right)), strict=True)
+    if tags[0] != tags[1]:
+        warn(
+            f"the orientation tags of left and right differ, {tags[0]} and {tags[1]}, and each was applied: "
+            "views of one rectified pair have one orientation",
+            PairWarning,
+        )
+    return images[0], images[1]
+
+
+def _read(path: str | os.PathLike[str], gray: bool) -> tuple[NDArray[Any], int]:
+    """Return an image and its orientation tag."""
+    image, tag = decode(path)
     if str(image.dtype) not in ("uint8", *_DEEP):
         raise FileError(f"{str(path)!r} holds {image.dtype} pixels, expected uint8, uint16 or float")
-    if image.ndim == 2:
-        return image
-    if image.shape[2] == 1:
-        return np.ascontiguousarray(image[:, :, 0])
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.ascontiguousarray(image.reshape(image.shape[:2])), tag
     if image.shape[2] not in (3, 4):
         raise FileError(f"{str(path)!r} has {image.shape[2]} channels, expected grey or colour")
-    colors = np.ascontiguousarray(image[:, :, 2::-1])
+    colors = np.ascontiguousarray(image[:, :, :3])
     if not gray:
-        return colors
+        return colors, tag
     if colors.dtype == np.float64:  # OpenCV's conversion stops at float32
-        return np.asarray(colors @ np.array([0.299, 0.587, 0.114]))
-    return np.asarray(cv2.cvtColor(colors, cv2.COLOR_RGB2GRAY))
+        return np.asarray(colors @ np.array([0.299, 0.587, 0.114])), tag
+    return np.asarray(cv2.cvtColor(colors, cv2.COLOR_RGB2GRAY)), tag
 
 
 def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:
@@ -101,8 +141,8 @@ def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:
     write_bytes(target, encode(suffix, image))
 
 
-def decode(path: str | os.PathLike[str]) -> NDArray[Any]:
-    """Return an image as it is stored, with the channels in OpenCV's order.
+def decode(path: str | os.PathLike[str]) -> tuple[NDArray[Any], int]:
+    """Return an image of any type, grey or RGB, as viewers show it, and its orientation tag.
 
     Raises
     ------
@@ -110,13 +150,77 @@ def decode(path: str | os.PathLike[str]) -> NDArray[Any]:
         If the file is missing or is not an image.
     """
     data = read_bytes(path)
+    with parsing(path, "image"):
+        if data.startswith(_NPY):
+            image, tag = read_npy(path, data), UPRIGHT
+            if image.ndim not in (2, 3) or image.size == 0:
+                raise FileError(f"{str(path)!r} must hold an array of an image, got {describe(image)}")
+            return image.astype(image.dtype.newbyteorder("="), copy=False), tag
+        tag = find_orientation(data)
+        if data.startswith(_TIFF):
+            stored = without_orientation(data)  # which some versions of OpenCV apply
+            found = _with_opencv(stored)
+            found = _with_tifffile(path, stored) if found is None else found
+        else:
+            found = _with_opencv(data)
+        if found is None:
+            raise FileError(f"{str(path)!r} is not an image that can be read")
+        return oriented(found, tag), tag
+
+
+def open_tiff(path: str | os.PathLike[str], file: Any) -> Any:
+    """Return the first page of a TIFF as tifffile has it, None if its pixels are not as they are shown.
+
+    Parameters
+    ----------
+    path : path
+        For messages.
+    file : tifffile.TiffFile
+
+    Raises
+    ------
+    FileError
+        If there is no page.
+    """
+    if not len(file.pages):
+        raise FileError(f"{str(path)!r} is a TIFF without an image")
+    page = file.pages.first
+    plain = page.planarconfig == 1 or page.samplesperpixel == 1
+    shown = str(getattr(page.photometric, "name", page.photometric)) in ("MINISBLACK", "RGB")
+    kind = "" if page.dtype is None else str(page.dtype)
+    known = kind in ("uint8", *_DEEP) and page.bitspersample == 8 * page.dtype.itemsize
+    return page if plain and shown and known and page.samplesperpixel in (1, 3, 4) and page.imagedepth == 1 else None
+
+
+def _with_opencv(data: bytes) -> NDArray[Any] | None:
+    if not data:
+        return None
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        with quiet_decoders():
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
-        image = None
+        return None
     if image is None:
-        raise FileError(f"{str(path)!r} is not an image that can be read")
-    return np.asarray(image)
+        return None
+    return image[:, :, 2::-1] if image.ndim == 3 and image.shape[2] > 2 else image
+
+
+def _with_tifffile(path: str | os.PathLike[str], data: bytes) -> NDArray[Any]:
+    """Return the first page of a TIFF that OpenCV does not decode."""
+    try:
+        import tifffile
+    except ModuleNotFoundError:
+        raise FileError(
+            f"{str(path)!r} is a TIFF that cannot be decoded here, broken or of a rare compression; "
+            "pip install 'stereokit[large]' reads more"
+        ) from None
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        page = open_tiff(path, file)
+        if page is None:
+            first = file.pages.first
+            layout = f"{getattr(first.photometric, 'name', first.photometric)}, {first.samplesperpixel} x {first.dtype}"
+            raise FileError(f"{str(path)!r} is a TIFF of a kind that cannot be decoded ({layout})")
+        return np.asarray(page.asarray())
 
 
 def encode(suffix: str, image: NDArray[Any]) -> bytes:
@@ -131,7 +235,8 @@ def encode(suffix: str, image: NDArray[Any]) -> bytes:
     # Left to itself, OpenCV 4 keeps float colour in TIFF as LogLuv, which loses digits; 5 is LZW.
     settings = [cv2.IMWRITE_TIFF_COMPRESSION, 5] if suffix.startswith(".tif") else []
     try:
-        ok, data = cv2.imencode(suffix, np.ascontiguousarray(stored), settings)
+        with quiet_decoders():
+            ok, data = cv2.imencode(suffix, np.ascontiguousarray(stored), settings)
     except cv2.error as error:
         raise FileError(f"cannot encode {describe(image)} as {suffix}") from error
     if not ok:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError
-from stereokit.io.atomic import read_bytes
+from stereokit.io.reading import parsing, read_bytes
 
 __all__ = [
     "pfm_bytes",
     "read_pfm",
 ]
 
-_HEADER = re.compile(rb"(P[fF])\s+(\d+)\s+(\d+)\s+([-+]?[0-9.]+(?:[eE][-+]?\d+)?)(?:\r\n|[ \t]*\n|\s)")
+_HEADER = re.compile(rb"(P[fF])\s+(\d{1,10})\s+(\d{1,10})\s+([-+]?[0-9.]+(?:[eE][-+]?\d+)?)(?:\r\n|[ \t]*\n|\s)")
 
 
 def read_pfm(path: str | os.PathLike[str]) -> NDArray[np.float32]:
@@ -31,6 +31,11 @@ def read_pfm(path: str | os.PathLike[str]) -> NDArray[np.float32]:
         If the file is missing or is no such PFM.
     """
     data = read_bytes(path)
+    with parsing(path, "PFM"):
+        return _parsed(path, data)
+
+
+def _parsed(path: str | os.PathLike[str], data: bytes) -> NDArray[np.float32]:
     header = _HEADER.match(data)
     if header is None:
         raise FileError(f"{str(path)!r} has no PFM header")

@@ -159,7 +159,7 @@ def test_json(tmp_path):
         ("cam0=[1 0 1; 0 1 1; 0 0 1]\nbaseline=3\n", "no field 'doffs'"),
         (MIDDLEBURY.replace("999.421 0 294.182", "999.421 0"), "cam0 must hold 9 numbers, got 8"),
         (MIDDLEBURY.replace("193.001", "wide"), "baseline must hold 1 numbers, got 'wide'"),
-        (MIDDLEBURY.replace("741", "inf"), "infinity"),
+        (MIDDLEBURY.replace("741", "inf"), "width must hold finite numbers"),
         (MIDDLEBURY.replace("193.001", "-1"), "baseline_m must be positive"),
         (KITTI.replace("P_rect_03", "P_rect_04"), "no field 'P_rect_03'"),
         ("P0: 1 2 3\n", "no field 'P2'"),

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from stereokit.errors import FileError, OptionError
-from stereokit.io import write_bytes
+from stereokit.io import parsing, read_bytes, write_bytes
 from stereokit_evaluation.common.folders import check_folder, make_folder
 
 __all__ = ["COLOR", "finished", "held", "publish", "target_of", "write_document"]
@@ -80,7 +80,7 @@ def held(
 
 def write_document(path: Path, content: dict[str, Any]) -> None:
     """Write what a person may want to read: JSON with names as they are."""
-    write_bytes(path, (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode())
+    write_bytes(path, (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace"))
 
 
 def finished(folder: Path, suffix: str) -> set[str]:
@@ -155,15 +155,13 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    try:
-        content = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return None
-    except (OSError, ValueError) as error:
-        raise FileError(f"{str(path)!r} is not a manifest that can be read; use --overwrite") from error
-    if not isinstance(content, dict):
-        raise FileError(f"{str(path)!r} is not a manifest that can be read; use --overwrite")
-    return content
+    with parsing(path, "manifest", "manifest must be one of this program's; use --overwrite"):
+        content = json.loads(read_bytes(path))
+        if not isinstance(content, dict):
+            raise ValueError("it is no object")
+        return content
 
 
 def _check_same(folder: Path, previous: dict[str, Any] | None, made_with: dict[str, Any], names: set[str]) -> None:

@@ -17,7 +17,6 @@ from typing import Annotated, Any
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from stereokit.cli.options import (
     DeviceOption,
@@ -34,6 +33,7 @@ from stereokit.cli.options import (
     parse_settings,
     write_json,
 )
+from stereokit.cli.output import Table
 from stereokit.errors import FileError, OptionError, StereokitError
 from stereokit.images.gray import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES

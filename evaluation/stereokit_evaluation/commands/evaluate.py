@@ -16,10 +16,10 @@ import typer
 from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from stereokit import __version__
 from stereokit.cli.options import DeviceOption, JsonOption, check_json, parse_settings, write_json
+from stereokit.cli.output import Table
 from stereokit.errors import OptionError
 from stereokit.io import write_image
 from stereokit_evaluation.common.folders import make_folder

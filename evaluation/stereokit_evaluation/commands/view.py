@@ -76,9 +76,8 @@ def view(
     if images[0].shape != images[1].shape:
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
         raise InputError(f"LEFT and RIGHT must have the same size and number of channels, got {sizes}")
-    camera = None if calibration is None else read_calibration(calibration, cameras)
-    if camera is not None:
-        camera.check_size(images[0].shape[1], images[0].shape[0])
+    size = images[0].shape[1], images[0].shape[0]
+    camera = None if calibration is None else read_calibration(calibration, cameras, size)
     known = None if truth is None else read_disparity(truth)
     if known is not None and known.shape != images[0].shape[:2]:
         raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {known.shape}")

@@ -92,7 +92,7 @@ def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:
     chosen: set[str] = set()
     for part in (text.strip() for text in which.split(",")):
         names = {f.name for f in everything if part and part in (f.name, f.name.rpartition("/")[2])}
-        if not names and (match := re.fullmatch(r"([0-9]+)(?:-([0-9]+))?", part)):
+        if not names and (match := re.fullmatch(r"([0-9]{1,18})(?:-([0-9]{1,18}))?", part)):
             first, last = int(match[1]), int(match[2] or match[1])
             if last < first:
                 raise OptionError(f"frames must be ranges with the smaller number first, got {part!r}")
@@ -105,7 +105,7 @@ def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:
 
 
 def _number(name: str) -> int | None:
-    match = re.search(r"([0-9]+)_1[01]$", name) or re.search(r"([0-9]+)$", name)
+    match = re.search(r"([0-9]{1,18})_1[01]$", name) or re.search(r"([0-9]{1,18})$", name)
     return int(match[1]) if match else None
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError, StereokitError
-from stereokit.io import read_disparity
+from stereokit.io import DISPARITY_SUFFIXES, read_disparity
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.kitti import Score, score
 
@@ -33,6 +33,9 @@ __all__ = [
     "seen_in_training",
     "with_matcher",
 ]
+
+
+_MAPS = (*DISPARITY_SUFFIXES, ".tif")
 
 
 class _Disparity(Protocol):
@@ -212,7 +215,7 @@ def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:
 
 
 def from_files(directory: str | Path) -> Estimator:
-    """Return an estimator that reads ``NAME.png`` (16-bit KITTI, 0 unknown), ``NAME.pfm`` or ``NAME.npy``.
+    """Return an estimator that reads ``NAME.png`` (16-bit KITTI, 0 unknown), ``.pfm``, ``.npy``, ``.tiff`` or ``.tif``.
 
     For a name with folders, such as ``2003/cones``, the last part alone will do. All unknown pixels count as
     not measured, and are filled before scoring.
@@ -228,9 +231,9 @@ def from_files(directory: str | Path) -> Estimator:
 
     def estimate(frame: Frame) -> Estimate:
         for name in (frame.name, frame.name.rpartition("/")[2]):
-            for ending in (".png", ".pfm", ".npy"):
+            for ending in _MAPS:
                 if (path := base / f"{name}{ending}").exists():
                     return Estimate(read_disparity(path))
-        raise FileError(f"no map {frame.name}.png, .pfm or .npy in {base}")
+        raise FileError(f"no map {frame.name}{', '.join(_MAPS)} in {str(base)!r}")
 
     return estimate

@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError, StereokitError
+from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, Watch, watched
 from stereokit_evaluation.data import datasets
 from stereokit_evaluation.data import frame as frames
-from stereokit_evaluation.scoring import kitti
-from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, Watch, watched
 from stereokit_evaluation.data.frame import Frame
-from stereokit_evaluation.study.configurations import PEER, Configuration, describe_error, fingerprint, title
+from stereokit_evaluation.scoring import kitti
 from stereokit_evaluation.scoring.kitti import score
 from stereokit_evaluation.scoring.runner import Result, Scored, Skipped
+from stereokit_evaluation.study.configurations import PEER, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
 
 __all__ = ["Row", "Study", "measure", "run_study"]

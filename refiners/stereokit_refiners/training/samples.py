@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,8 +23,7 @@ from numpy.typing import NDArray
 
 import stereokit
 from stereokit.defaults import defaults_of
-from stereokit.errors import FileError
-from stereokit.io import make_folder, write_bytes
+from stereokit.io import make_folder, parsing, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
 from stereokit.result import Disparity
@@ -292,8 +290,8 @@ def store_variant(pair: Pair, method: str, seed: int, number: int, max_disparity
 
 
 def _read(path: Path) -> Sample:
-    try:
-        with path.open("rb") as file, np.load(file) as held:
+    with parsing(path, "sample", "cache must hold samples of this program"), path.open("rb") as file:
+        with np.load(file) as held:
             return Sample(
                 held["coarse"],
                 held["confidence"],
@@ -303,8 +301,6 @@ def _read(path: Path) -> Sample:
                 held["seen"],
                 tuple(held["size"].tolist()),
             )
-    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-        raise FileError(f"cache must hold samples of this program, cannot read {str(path)!r} ({error})") from None
 
 
 class Shelf(Sequence[Sample]):

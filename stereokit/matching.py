@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.checks import doubts, doubts_about_density
 from stereokit.costs.rows import Levels, Pair
 from stereokit.cuda.driver import has_device, require_device
 from stereokit.defaults import METHODS, defaults_of
@@ -36,6 +37,7 @@ from stereokit.images.gray import (
 from stereokit.kernels.threads import available_threads, crew
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.methods import check_levels, find_refiner, option_names, parse_method
+from stereokit.notices import PairWarning, collecting, warn
 from stereokit.postprocess.chain import Chain, post_process
 from stereokit.postprocess.fill import FILLS
 from stereokit.registry import AGGREGATIONS, COSTS
@@ -257,12 +259,20 @@ class Matcher:
             ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
             a filled map is `min_disparity` everywhere; learned refiners may add a pixel or two.
 
+        Warns
+        -----
+        PairWarning
+            If both images are the same, or hardly anything could be measured; see `stereokit.checks`.
+
         Raises
         ------
         InputError
             If the images cannot be used.
         """
-        return self._call(left, right, self.threads)
+        found = self._call(left, right, self.threads)
+        for line in doubts(left, right, found, self.min_disparity, self.max_disparity):
+            warn(line, PairWarning)
+        return found
 
     def map(
         self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None
@@ -284,6 +294,11 @@ class Matcher:
         ------
         Disparity
 
+        Warns
+        -----
+        PairWarning
+            At the first pair of which hardly anything could be measured.
+
         Raises
         ------
         InputError
@@ -294,6 +309,7 @@ class Matcher:
         workers = self.threads if self._cuda is None else min(2, self.threads)  # each has buffers on the device
         with ThreadPoolExecutor(workers, thread_name_prefix="stereokit-map") as executor:
             try:
+                doubted = False
                 failure: BaseException | None = None  # of the source: what it gave before is still matched
                 for done in itertools.count(1):
                     while failure is None and len(ahead) < 2 * self.threads:
@@ -311,7 +327,12 @@ class Matcher:
                             return
                         assert failure is not None
                         raise failure
-                    yield ahead.popleft().result()
+                    found = ahead.popleft().result()
+                    for line in doubts_about_density(found.density, self.min_disparity, self.max_disparity):
+                        if not doubted:
+                            warn(f"pair {done - 1}: {line}", PairWarning)
+                        doubted = True
+                    yield found
                     if progress is not None:
                         progress(done)
             finally:
@@ -426,7 +447,8 @@ def warmup(*methods: str, max_disparity: int = 128) -> None:
     """
     image = np.arange(16 * 16, dtype=np.uint8).reshape(16, 16)
     for method in methods or METHODS:
-        Matcher(method, max_disparity=max_disparity)(image, image)
+        with collecting():
+            Matcher(method, max_disparity=max_disparity)(image, image)
 
 
 def _forget_matchers() -> None:

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,6 +29,14 @@ from hypothesis import settings  # noqa: E402
 
 settings.register_profile("stereokit", derandomize=True, deadline=None, max_examples=20)
 settings.load_profile("stereokit")
+
+
+@pytest.fixture(autouse=True)
+def pairs_need_not_be_good():
+    """Let tests match noise, blank images and one image twice; what is warned of is tested with `pytest.warns`."""
+    from stereokit.notices import PairWarning
+
+    warnings.filterwarnings("ignore", category=PairWarning)
 
 
 @pytest.fixture(scope="session")

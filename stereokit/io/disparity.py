@@ -31,6 +31,7 @@ __all__ = [
 DISPARITY_SUFFIXES = (".png", ".pfm", ".npy", ".tiff")
 """What `read_disparity` and `write_disparity` know; ``.tif`` is taken as ``.tiff``."""
 
+_MOST = 65535  # of a KITTI PNG
 _STEPS = 16  # of OpenCV's fixed point in a pixel
 
 
@@ -77,22 +78,23 @@ def _read(path: str | os.PathLike[str], suffix: str) -> NDArray[np.float32]:
     return disparity
 
 
-def write_disparity(path: str | os.PathLike[str], disparity: ArrayLike) -> None:
+def write_disparity(path: str | os.PathLike[str], disparity: ArrayLike, *, clip: bool = False) -> None:
     """Write a disparity map; the format follows from the suffix.
 
     Parameters
     ----------
     path : path
-        ``.png``: KITTI, 16-bit, 1/256 pixel, 0 where invalid. As in the devkit, valid values are brought into
-        what the format can say, 1/256 to 65535/256 pixels. ``.pfm``: infinite where invalid. ``.npy`` and
-        ``.tiff``: float32, NaN kept.
+        ``.png``: KITTI, 16-bit, 1/256 pixel, 0 where invalid; as in the devkit, a valid 0 becomes 1/256. ``.pfm``:
+        infinite where invalid. ``.npy`` and ``.tiff``: float32, NaN kept.
     disparity : (H, W) float
         Pixels, not finite where invalid.
+    clip : bool
+        Bring what a ``.png`` cannot say, below 0 and above 65535/256 pixels, to its ends.
 
     Raises
     ------
     InputError
-        If `disparity` is not a 2-d array of floats, or is negative somewhere and the file is a ``.png``.
+        If `disparity` is not a 2-d array of floats, or has values that a ``.png`` cannot say and `clip` is False.
     FileError
         If the suffix is unknown or the file cannot be written.
     """
@@ -100,11 +102,14 @@ def write_disparity(path: str | os.PathLike[str], disparity: ArrayLike) -> None:
     values = _checked_map(disparity)
     known = np.isfinite(values)
     if suffix == ".png":
-        if known.any() and values[known].min() < 0:
-            lowest = values[known].min()
-            raise InputError(f"disparity must not be negative for KITTI's .png (use .pfm, .npy), got {lowest:g}")
-        steps = np.where(known, values, np.float32(0)) * np.float32(256)
-        data = encode(".png", np.where(known, np.clip(np.rint(steps), 1, 65535), 0).astype(np.uint16))
+        steps = np.rint(np.where(known, values, np.float32(0)) * np.float32(256))
+        if not clip and (values.min(initial=0, where=known) < 0 or steps.max() > _MOST):
+            span = f"{values.min(initial=np.inf, where=known):g} .. {values.max(initial=-np.inf, where=known):g}"
+            raise InputError(
+                f"disparity must not be negative or above {_MOST / 256:g} px for KITTI's .png, got {span}; "
+                "use .pfm, .npy or .tiff, or clip=True"
+            )
+        data = encode(".png", np.where(known, np.clip(steps, 1, _MOST), 0).astype(np.uint16))
     elif suffix == ".pfm":
         data = pfm_bytes(values)
     elif suffix == ".npy":

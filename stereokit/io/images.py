@@ -20,12 +20,16 @@ from stereokit.notices import PairWarning, warn
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "NPY_START",
     "READABLE_SUFFIXES",
+    "TIFF_STARTS",
     "decode",
     "describe",
+    "doubt_orientations",
     "encode",
     "open_tiff",
     "read_image",
+    "read_oriented",
     "read_pair",
     "write_image",
 ]
@@ -41,8 +45,8 @@ _DEEP = {
     "float32": (".tiff", ".tif"),
     "float64": (".tiff", ".tif"),
 }
-_NPY = b"\x93NUMPY"
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+NPY_START = b"\x93NUMPY"
+TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it then raises
 
@@ -68,7 +72,7 @@ def read_image(path: str | os.PathLike[str], gray: bool = False) -> NDArray[Any]
     FileError
         If the file is missing or is not an image of these types.
     """
-    return _read(path, gray)[0]
+    return read_oriented(path, gray)[0]
 
 
 def read_pair(
@@ -81,18 +85,29 @@ def read_pair(
     FileError
         If a file is missing or is not an image.
     """
-    images, tags = zip(*(_read(path, gray) for path in (left, right)), strict=True)
-    if tags[0] != tags[1]:
+    (a, tag_a), (b, tag_b) = (read_oriented(path, gray) for path in (left, right))
+    doubt_orientations(tag_a, tag_b)
+    return a, b
+
+
+def doubt_orientations(left: int, right: int) -> None:
+    """Warn if the orientation tags of the two views differ."""
+    if left != right:
         warn(
-            f"the orientation tags of left and right differ, {tags[0]} and {tags[1]}, and each was applied: "
-            "views of one rectified pair have one orientation",
+            f"the orientation tags of left and right differ, {left} and {right}, and each was applied: "
+            "the views of a rectified pair have one orientation",
             PairWarning,
         )
-    return images[0], images[1]
 
 
-def _read(path: str | os.PathLike[str], gray: bool) -> tuple[NDArray[Any], int]:
-    """Return an image and its orientation tag."""
+def read_oriented(path: str | os.PathLike[str], gray: bool = False) -> tuple[NDArray[Any], int]:
+    """Return an image as `read_image` does, and the orientation tag that was applied.
+
+    Raises
+    ------
+    FileError
+        If the file is missing or is not an image.
+    """
     image, tag = decode(path)
     if str(image.dtype) not in ("uint8", *_DEEP):
         raise FileError(f"{str(path)!r} holds {image.dtype} pixels, expected uint8, uint16 or float")
@@ -151,20 +166,22 @@ def decode(path: str | os.PathLike[str]) -> tuple[NDArray[Any], int]:
     """
     data = read_bytes(path)
     with parsing(path, "image"):
-        if data.startswith(_NPY):
+        if data.startswith(NPY_START):
             image, tag = read_npy(path, data), UPRIGHT
             if image.ndim not in (2, 3) or image.size == 0:
                 raise FileError(f"{str(path)!r} must hold an array of an image, got {describe(image)}")
             return image.astype(image.dtype.newbyteorder("="), copy=False), tag
         tag = find_orientation(data)
-        if data.startswith(_TIFF):
+        if data.startswith(TIFF_STARTS):
             stored = without_orientation(data)  # which some versions of OpenCV apply
             found = _with_opencv(stored)
             found = _with_tifffile(path, stored) if found is None else found
         else:
             found = _with_opencv(data)
         if found is None:
-            raise FileError(f"{str(path)!r} is not an image that can be read")
+            what = {".npy": "npy file", ".tif": "TIFF", ".tiff": "TIFF"}.get(os.path.splitext(path)[1].lower())
+            reason = "is not an image that can be read" if what is None else f"is not a readable {what}"
+            raise FileError(f"{str(path)!r} {reason}")
         return oriented(found, tag), tag
 
 

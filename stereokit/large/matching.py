@@ -16,9 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from stereokit.checks import doubts_about_density, doubts_about_views
 from stereokit.costs import Zncc
 from stereokit.errors import InputError, OptionError
 from stereokit.images.gray import GrayPair, check_integer
+from stereokit.io.images import doubt_orientations
 from stereokit.kernels.workspace import Workspace
 from stereokit.large.bands import Bands
 from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes, window_model
@@ -27,6 +29,7 @@ from stereokit.large.plan import Plan, plan
 from stereokit.large.sources import Source, open_source
 from stereokit.large.tones import BLOCK_NBYTES, Ranges, Tone, find_ranges, find_tone
 from stereokit.matching import Matcher
+from stereokit.notices import PairWarning, warn
 from stereokit.result import Disparity
 
 __all__ = ["OVERLAP", "LargeResult", "match_large"]
@@ -128,6 +131,11 @@ def match_large(
     -------
     LargeResult
 
+    Warns
+    -----
+    PairWarning
+        If both images are the same, their orientation tags differ, or hardly anything could be measured.
+
     Raises
     ------
     InputError, OptionError, FileError
@@ -143,6 +151,7 @@ def match_large(
     limit = None if memory is None else parse_memory(memory)
     sources = open_source("left", left), open_source("right", right)
     _check_pair(*sources)
+    doubt_orientations(sources[0].orientation, sources[1].orientation)
     tone = find_tone(*sources)
     height, width = sources[0].shape[:2]
     windows = _plan(matcher, sources, tone, overlap, limit, target)
@@ -153,6 +162,9 @@ def match_large(
     write_bands(target, height, width, bands)
     total = len(windows.rows) * len(windows.columns)
     density = bands.measured / (height * width)
+    views = doubts_about_views(bands.same)
+    for line in views or doubts_about_density(density, matcher.min_disparity, matcher.max_disparity):
+        warn(line, PairWarning)
     return LargeResult(target, height, width, windows.window, total, overlap, density, matcher)
 
 

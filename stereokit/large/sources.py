@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError
 from stereokit.images.gray import checked_image
-from stereokit.io import parsing, read_image, read_npy
-from stereokit.io.images import open_tiff
+from stereokit.io import parsing, read_npy
+from stereokit.io.images import NPY_START, TIFF_STARTS, open_tiff, read_oriented
 from stereokit.io.orientation import UPRIGHT, oriented, stored_window
 
 __all__ = ["Source", "open_source"]
 
-_TIFF = (".tif", ".tiff")
 _ORIENTATION = 0x0112
 
 
@@ -41,6 +40,8 @@ class Source(Protocol):
         Bytes that reading one piece takes beside the window.
     held_nbytes : int
         Bytes that the source itself holds in memory.
+    orientation : int
+        The tag that was applied, 1 to 8.
     """
 
     shape: tuple[int, ...]
@@ -48,6 +49,7 @@ class Source(Protocol):
     row_step: int
     piece_nbytes: int
     held_nbytes: int
+    orientation: int
 
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
         """Return rows y0 to y1 of columns x0 to x1."""
@@ -62,7 +64,7 @@ def open_source(name: str, image: Any) -> Source:
     name : str
         What messages call the argument.
     image : (H, W) or (H, W, 3) array, or path
-        ``.npy`` is mapped, of ``.tif`` and ``.tiff`` tiles are decoded as needed, other files are read whole.
+        An npy file is mapped, of a TIFF tiles are decoded as needed, other files are read whole.
 
     Raises
     ------
@@ -76,14 +78,16 @@ def open_source(name: str, image: Any) -> Source:
     if not isinstance(image, (str, os.PathLike)):
         return _Array(checked_image(name, image), 0)
     path = Path(image)
-    suffix = path.suffix.lower()
-    if suffix == ".npy":
+    with parsing(path, "image"), path.open("rb") as file:
+        start = file.read(8)
+    if start.startswith(NPY_START):
         return _Mapped(name, path)
-    page = _tiled(name, path) if suffix in _TIFF else None
+    page = _tiled(name, path) if start.startswith(TIFF_STARTS) else None
     if page is not None:
         return _Tiff(name, path, page)
-    whole = checked_image(name, read_image(path))
-    return _Array(whole, whole.nbytes)
+    whole, orientation = read_oriented(path)
+    whole = checked_image(name, whole)
+    return _Array(whole, whole.nbytes, orientation)
 
 
 def _checked(name: str, shape: tuple[int, ...], dtype: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -95,8 +99,9 @@ def _checked(name: str, shape: tuple[int, ...], dtype: Any) -> tuple[tuple[int, 
 class _Array:
     row_step, piece_nbytes = 1, 0
 
-    def __init__(self, array: NDArray[Any], held_nbytes: int) -> None:
+    def __init__(self, array: NDArray[Any], held_nbytes: int, orientation: int = UPRIGHT) -> None:
         self.shape, self.dtype, self.held_nbytes = array.shape, array.dtype, held_nbytes
+        self.orientation = orientation
         self._array = array
 
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
@@ -104,7 +109,7 @@ class _Array:
 
 
 class _Mapped:
-    row_step, piece_nbytes, held_nbytes = 1, 0, 0
+    row_step, piece_nbytes, held_nbytes, orientation = 1, 0, 0, UPRIGHT
 
     def __init__(self, name: str, path: Path) -> None:
         self._path = path
@@ -143,20 +148,20 @@ class _Tiff:
             if min(*self._tile, height, width) < 1:
                 raise FileError(f"{str(path)!r} is a broken TIFF: {width}x{height} in pieces of {tile[1]}x{tile[0]}")
             tag = page.tags.valueof(_ORIENTATION, default=UPRIGHT)
-            self._turned = tag if tag in range(1, 9) else UPRIGHT
-            if self._turned > 4:  # on its side
+            self.orientation = tag if tag in range(1, 9) else UPRIGHT
+            if self.orientation > 4:  # on its side
                 height, width = width, height
             color = (3,) if page.samplesperpixel > 1 else ()
         self.shape, self.dtype = _checked(name, (height, width, *color), page.dtype)
-        self.row_step = self._tile[0] if self._turned <= 4 else self._tile[1]
+        self.row_step = self._tile[0] if self.orientation <= 4 else self._tile[1]
         pixels = self._tile[0] * self._tile[1] * page.samplesperpixel
         self.piece_nbytes = 3 * pixels * self.dtype.itemsize  # as stored, decoded, and on its way to the window
 
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
         height, width = self.shape[:2]
-        place = stored_window(self._turned, height, width, y0, y1, x0, x1)
+        place = stored_window(self.orientation, height, width, y0, y1, x0, x1)
         with parsing(self._path, "TIFF"):
-            return oriented(self._read(*place), self._turned)
+            return oriented(self._read(*place), self.orientation)
 
     def _read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
         out = np.zeros((y1 - y0, x1 - x0, *self.shape[2:]), self.dtype)

@@ -321,7 +321,7 @@ def test_tiff_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     image = np.zeros((20, 30), np.uint8)
     with pytest.raises(StereokitError, match=r"stereokit\[large\]"):
         stereokit.match_large(image, image, tmp_path / "out.tif", "S2")
-    (tmp_path / "a.tif").write_bytes(b"")
+    (tmp_path / "a.tif").write_bytes(b"II*\0")
     with pytest.raises(StereokitError, match=r"stereokit\[large\]"):
         stereokit.match_large(tmp_path / "a.tif", image, tmp_path / "out.npy", "S2")
 

@@ -99,7 +99,7 @@ def test_a_list_in_its_forms(tmp_path):
         (b"a.png,b.png,../out\n", "name must be a file name"),
         (b"a.png,b.png,/etc/x\n", "name must be a file name"),
         (b"a.png,b.png,.hidden\n", "name must be a file name"),
-        (b"\xff\xfe\x00", "not UTF-8"),
+        (b"\xff\xfe\x00", "not in UTF-8"),
         (b"\n# nothing\n", "no pairs"),
         (b"", "no pairs"),
     ],
@@ -245,11 +245,11 @@ def test_a_full_disk_ends_the_run_and_keeps_what_is_there(tmp_path, monkeypatch)
     write_pairs(tmp_path, [f"{k:02d}" for k in range(20)])
     real, calls = batch_job.write_disparity, []
 
-    def write(path, disparity):
+    def write(path, disparity, **options):
         calls.append(path)
         if len(calls) > 3:
             raise FileError("cannot write: No space left on device") from OSError(errno.ENOSPC, "full")
-        real(path, disparity)
+        real(path, disparity, **options)
 
     monkeypatch.setattr(batch_job, "write_disparity", write)
     line = refused(tmp_path, "-o", tmp_path / "out", "--workers", "1")

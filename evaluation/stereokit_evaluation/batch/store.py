@@ -22,7 +22,7 @@ from stereokit.errors import FileError, OptionError
 from stereokit.io import parsing, read_bytes, write_bytes
 from stereokit_evaluation.common.folders import check_folder, make_folder
 
-__all__ = ["COLOR", "finished", "held", "publish", "target_of", "write_document"]
+__all__ = ["COLOR", "finished", "held", "make_below", "mark_of", "publish", "target_of", "write_document"]
 
 COLOR = "color"
 """Folder of the coloured pictures."""
@@ -112,12 +112,11 @@ def publish(folder: Path, target: Path, write: Callable[[Path], object]) -> bool
     write : callable
         Writes the file at the path that it is given.
     """
-    partial = folder / _PARTIAL
-    partial.mkdir(exist_ok=True)
+    partial = make_below(folder, _PARTIAL)
     temporary = partial / (secrets.token_hex(8) + target.suffix)
     try:
         write(temporary)
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_below(folder, *target.parent.relative_to(folder).parts)
         try:
             os.link(temporary, target)
         except FileExistsError:
@@ -131,6 +130,29 @@ def publish(folder: Path, target: Path, write: Callable[[Path], object]) -> bool
         return True
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def make_below(folder: Path, *parts: str) -> Path:
+    """Make folders in the batch's folder and return the last, but not that folder: it may have been removed meanwhile.
+
+    Raises
+    ------
+    OSError
+        If one cannot be made.
+    """
+    for part in parts:
+        folder = folder / part
+        folder.mkdir(exist_ok=True)
+    return folder
+
+
+def mark_of(folder: Path) -> tuple[int, int] | None:
+    """Return what tells a folder from another that is put in its place, None if it is not there."""
+    try:
+        state = os.stat(folder)
+    except OSError:
+        return None
+    return state.st_dev, state.st_ino
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stereokit.calibration import Calibration
 from stereokit.errors import OptionError
-from stereokit.io import read_image
+from stereokit.io import read_image, read_pair
 
 __all__ = ["Frame", "Loader", "select"]
 
@@ -57,6 +57,12 @@ class Frame:
     def load_right(self, *, gray: bool = False) -> NDArray[Any]:
         """Return the right image, as `load_left`."""
         return _image(self.right, gray)
+
+    def load_pair(self, *, gray: bool = False) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return both images, as `load_left`; warn where the orientation tags of two files differ."""
+        if isinstance(self.left, Path) and isinstance(self.right, Path):
+            return read_pair(self.left, self.right, gray)
+        return self.load_left(gray=gray), self.load_right(gray=gray)
 
     def load_noc(self) -> NDArray[np.float32] | None:
         """Return the disparity of pixels that both cameras see, float32 (H, W), NaN unknown, or None."""

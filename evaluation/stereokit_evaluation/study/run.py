@@ -91,7 +91,7 @@ class _Loaded:
 
     @cached_property
     def images(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        left, right = self.frame.load_left(gray=self.gray), self.frame.load_right(gray=self.gray)
+        left, right = self.frame.load_pair(gray=self.gray)
         if left.shape != right.shape:
             raise InputError(f"left and right must have one size, got {left.shape} and {right.shape}")
         return left, right

@@ -26,6 +26,7 @@ from stereokit.defaults import defaults_of
 from stereokit.io import make_folder, parsing, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
+from stereokit.notices import collecting
 from stereokit.result import Disparity
 from stereokit_refiners.training.augment import Views, mirrored, moved_objects, photographed, rescaled
 
@@ -210,7 +211,9 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     noc, occ = views.noc, views.occ
     left, right = _even(views.left), _even(views.right)
     keeper = _Keeper()
-    stereokit.Matcher(method, max_disparity=max_disparity, scale=0.5, refiner=keeper, threads=1, **options)(left, right)
+    matcher = stereokit.Matcher(method, max_disparity=max_disparity, scale=0.5, refiner=keeper, threads=1, **options)
+    with collecting():  # hard pairs are wanted
+        matcher(left, right)
     found = keeper.coarse
     height, width = left.shape
     truth = np.zeros((height, width), np.uint16)

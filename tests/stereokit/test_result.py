@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from stereokit import io
 from stereokit.calibration import Calibration
 from stereokit.errors import FileError, InputError, OptionError
+from stereokit.images.display import to_display
 from stereokit.io import read_disparity
-from stereokit.result import Disparity, colorize
+from stereokit.result import Disparity, color_range, colorize
 
 NAN = np.nan
 MAP = np.array([[10, 20, NAN], [40, 5, 1]], np.float32)
@@ -103,3 +105,53 @@ def test_inputs_stay_as_they_are():
     kept = strided.copy()
     colorize(strided)
     np.testing.assert_array_equal(strided, kept)
+
+
+def test_the_automatic_range_holds_negative_and_far_disparities():
+    spread = np.linspace(0, 127, 4000, dtype=np.float32).reshape(40, 100)
+    for low in (-64, -200, 512, 3000):
+        values = spread + low
+        colors = colorize(values)
+        assert len(np.unique(colors.reshape(-1, 3), axis=0)) > 200
+        assert color_range(values) == pytest.approx((low + 1.27, low + 125.73), abs=0.1)
+        assert (colorize(values, high=low + 50)[:, -1] == colorize(np.float32([[1]]), 0, 1)).all()
+    assert color_range(spread) == (0, pytest.approx(125.73, abs=0.1))  # as ever: 0 is dark blue
+    assert color_range(np.full((2, 2), NAN, np.float32)) == (0, 1)
+    assert color_range(np.full((2, 2), 7, np.float32)) == (0, 7)
+    assert color_range(np.full((2, 2), -7, np.float32)) == (-7, -6)
+
+
+@pytest.mark.parametrize("value", [300.5, 256.0, -0.25])
+def test_a_png_refuses_what_it_cannot_say(tmp_path, value):
+    values = np.array([[1, value, NAN]], np.float32)
+    result = Disparity(values, np.isfinite(values))
+    for write in (result.save, lambda path, **options: io.write_disparity(path, values, **options)):
+        with pytest.raises(InputError, match=r"255\.996 px .* clip=True"):
+            write(tmp_path / "a.png")
+        assert not any(tmp_path.iterdir())
+        write(tmp_path / "a.png", clip=True)
+        end = 65535 / 256 if value > 0 else 1 / 256
+        np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.png"), np.float32([[1, end, NAN]]))
+        (tmp_path / "a.png").unlink()
+        write(tmp_path / "a.pfm")
+        np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.pfm"), values)
+        (tmp_path / "a.pfm").unlink()
+
+
+def test_images_of_any_range_are_shown_alike():
+    image = np.random.default_rng(0).integers(0, 256, (50, 60, 3)).astype(np.uint8)
+    assert to_display(image) is image
+    for other in (image.astype(np.uint16) * 16, image.astype(np.uint16) * 4 + 300, image.astype(np.float32) / 255,
+                  image.astype(np.float64) * -3.0 * -1 - 1000):  # fmt: skip
+        assert np.abs(to_display(other).astype(int) - image).max() <= 4
+    glare = image.astype(np.float32)
+    glare[0, 0] = 1e9
+    glare[1, 1] = -3.4e38
+    glare[2, 2] = NAN
+    shown = to_display(glare)
+    assert np.abs(shown[3:].astype(int) - image[3:]).max() <= 4
+    assert (shown[0, 0] == 255).all() and (shown[1, 1] == 0).all() and (shown[2, 2] == 0).all()
+    assert (
+        to_display(np.full((2, 2), NAN)).max() == 0
+        and to_display(np.full((2, 2), 9, np.uint16)).tolist()[0] == [128] * 2
+    )

@@ -18,6 +18,7 @@ import numpy as np
 import stereokit
 from stereokit.errors import StereokitError
 from stereokit.kernels.threads import available_threads
+from stereokit.notices import collecting
 from stereokit_evaluation.batch.job import Job, Outcome, matcher_of, work
 from stereokit_evaluation.batch.pairs import Pair
 from stereokit_evaluation.batch.store import finished, held, mark_of
@@ -224,7 +225,8 @@ def on_threads(
 def _compile(job: Job) -> bool:
     """Match a small pair, so that threads do not compile side by side."""
     small = np.zeros((32, 32), np.uint8)
-    matcher_of(job)(small, small)
+    with collecting():
+        matcher_of(job)(small, small)
     return True
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError, StereokitError
+from stereokit.notices import collecting
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, Watch, watched
 from stereokit_evaluation.data import datasets
 from stereokit_evaluation.data import frame as frames
@@ -167,7 +168,7 @@ def run_study(
     common = [_source(), repeats, gray, about_times]
     try:
         for frame in every:
-            loaded = _Loaded(frame, gray)
+            loaded, doubts = _Loaded(frame, gray), list[str]()
             step(frame.name, sum(index in missing for index in range(len(configurations))))
             for index, configuration in enumerate(configurations):
                 if index in missing:
@@ -184,7 +185,9 @@ def run_study(
                     break
                 if record is None:
                     try:
-                        record = measure(configuration, loaded, repeats, warm=index in warm)
+                        with collecting() as lines:
+                            record = measure(configuration, loaded, repeats, warm=index in warm)
+                        doubts += lines
                     except ImportError as error:  # a refiner's runtime, asked for at its first call
                         missing[index] = describe_error(error)
                         continue
@@ -197,6 +200,8 @@ def run_study(
                 else:
                     study.reused += 1
                 done[index][frame.name] = record
+            for line in doubts[:1]:
+                tell(f"warning: {frame.name}: {line}")
     except KeyboardInterrupt:
         study.interrupted = True
     _pool(study, configurations, done, missing, failed)

@@ -26,7 +26,8 @@ class Table(table.Table):
         super().__init__(*heads, title=None if title is None else Text(one_line(title), "table.title"), **options)
 
     def add_column(self, header: Any = "", *arguments: Any, **options: Any) -> None:
-        """Add a column; its head is shown as it is."""
+        """Add a column; its head is shown as it is, and what is too long for it goes on in the next line."""
+        options.setdefault("overflow", "fold")
         super().add_column(Text(one_line(header)) if isinstance(header, str) else header, *arguments, **options)
 
     def add_row(self, *cells: Any, **options: Any) -> None:

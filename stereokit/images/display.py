@@ -37,8 +37,8 @@ def to_display(image: NDArray[Any]) -> NDArray[np.uint8]:
     if values.size == 0:
         return np.zeros(image.shape, np.uint8)
     low, high = np.percentile(values[:: 1 + values.size // _MOST_SAMPLES].astype(np.float64), _SHARES)
-    if high <= low:  # one level, to which any grey will do
-        low, high = low - 1, low + 1
+    if high <= low:  # one level: white, or black if it is not positive
+        low, high = min(low - 1, 0.0), max(low, 0.0)
     scaled = (np.where(known, image, low).astype(np.float64) - low) / (high - low)
     scaled[~known] = 0
     shown: NDArray[np.uint8] = np.rint(np.clip(scaled, 0, 1) * 255).astype(np.uint8)

@@ -153,5 +153,5 @@ def test_images_of_any_range_are_shown_alike():
     assert (shown[0, 0] == 255).all() and (shown[1, 1] == 0).all() and (shown[2, 2] == 0).all()
     assert (
         to_display(np.full((2, 2), NAN)).max() == 0
-        and to_display(np.full((2, 2), 9, np.uint16)).tolist()[0] == [128] * 2
+        and to_display(np.full((2, 2), 9, np.uint16)).min() == 255
     )

@@ -1,16 +1,24 @@
 """Classical stereo matching in plain Python: Census and ZNCC costs, SGM and domain-transform aggregation.
 
 >>> import stereokit
->>> disparity = stereokit.match(left, right, method="zncc+sgm")  # doctest: +SKIP
+>>> disparity = stereokit.match(left, right)  # doctest: +SKIP
 """
 
 from stereokit.calibration import Calibration
 from stereokit.costs import Census, RowCost, Zncc
-from stereokit.errors import DeviceError, FileError, InputError, OptionError, StereokitError, UnknownNameError
+from stereokit.errors import (
+    DeviceError,
+    FileError,
+    InputError,
+    OptionError,
+    StereokitError,
+    StereokitWarning,
+    UnknownNameError,
+)
 from stereokit.io import read_disparity, read_image, write_disparity
 from stereokit.large import LargeResult, match_large
 from stereokit.matching import METHODS, Matcher, match, warmup
-from stereokit.notices import PairWarning, StereokitWarning
+from stereokit.notices import PairWarning
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
 from stereokit.selection import select

@@ -13,11 +13,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-__all__ = ["PairWarning", "StereokitWarning", "collecting", "warn"]
+from stereokit.errors import StereokitWarning
 
-
-class StereokitWarning(UserWarning):
-    """Something looks wrong, and the work goes on."""
+__all__ = ["PairWarning", "collecting", "warn"]
 
 
 class PairWarning(StereokitWarning):

@@ -86,8 +86,10 @@ def main() -> None:
     keep_stderr()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what is no text
-    if not sys.warnoptions:  # what libraries have to say to programmers
-        warnings.simplefilter("ignore")
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # what libraries have to say to programmers
+        warnings.filterwarnings("default", module="stereokit")
+    warnings.showwarning = lambda message, *_, **__: _tell(str(message))
     with _ending_by_signal():
         try:
             app(prog_name="stereokit")

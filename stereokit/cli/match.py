@@ -44,7 +44,7 @@ def match(
         Path,
         typer.Option("--output", "-o", metavar="FILE", help=".png (KITTI, x256), .pfm, .npy or .tiff."),
     ],
-    method: MethodOption = "zncc+sgm",
+    method: MethodOption = "census+sgm",
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,
@@ -203,10 +203,10 @@ def _write_cloud(path: Path, result: Disparity, camera: Calibration, image: NDAr
     import numpy as np
 
     from stereokit import io
-    from stereokit.images.display import to_display
+    from stereokit.images.intensity import display_8bit
 
     points = result.points(camera)
     kept = np.isfinite(points).all(axis=2)
-    shown = to_display(image)
+    shown = display_8bit(image)
     colors = shown if shown.ndim == 3 else np.repeat(shown[:, :, None], 3, axis=2)
     io.write_ply(path, points[kept], colors[kept])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import FileError, InputError
+from stereokit.images.intensity import to_gray
 from stereokit.io.atomic import check_output, write_bytes
 from stereokit.io.orientation import UPRIGHT, find_orientation, oriented, without_orientation
 from stereokit.io.quiet import quiet_decoders
@@ -116,11 +117,7 @@ def read_oriented(path: str | os.PathLike[str], gray: bool = False) -> tuple[NDA
     if image.shape[2] not in (3, 4):
         raise FileError(f"{str(path)!r} has {image.shape[2]} channels, expected grey or colour")
     colors = np.ascontiguousarray(image[:, :, :3])
-    if not gray:
-        return colors, tag
-    if colors.dtype == np.float64:  # OpenCV's conversion stops at float32
-        return np.asarray(colors @ np.array([0.299, 0.587, 0.114])), tag
-    return np.asarray(cv2.cvtColor(colors, cv2.COLOR_RGB2GRAY)), tag
+    return (to_gray(colors) if gray else colors), tag
 
 
 def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError
-from stereokit.images.gray import checked_image
+from stereokit.images.check import checked_image
 from stereokit.io import parsing, read_npy
 from stereokit.io.images import NPY_START, TIFF_STARTS, open_tiff, read_oriented
 from stereokit.io.orientation import UPRIGHT, oriented, stored_window

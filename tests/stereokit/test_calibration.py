@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from stereokit.calibration import Calibration, read_calibration
-from stereokit.errors import FileError, InputError, OptionError
-from stereokit.notices import StereokitWarning
+from stereokit.errors import FileError, InputError, OptionError, StereokitWarning
 
 DATA = Path(os.environ.get("STEREOKIT_DATA", Path(__file__).parents[3] / "shared" / "data"))
 NAN = np.nan

@@ -11,7 +11,8 @@ import pytest
 
 import stereokit
 from stereokit.checks import doubts, doubts_about_density, low_density, same_pixels
-from stereokit.notices import PairWarning, StereokitWarning, collecting, warn
+from stereokit.errors import StereokitWarning
+from stereokit.notices import PairWarning, collecting, warn
 from stereokit.result import Disparity
 
 NOISE = cv2.GaussianBlur(np.random.default_rng(0).normal(128, 90, (60, 700)), (0, 0), 0.8)

@@ -10,7 +10,6 @@ import pytest
 from stereokit import io
 from stereokit.calibration import Calibration
 from stereokit.errors import FileError, InputError, OptionError
-from stereokit.images.display import to_display
 from stereokit.io import read_disparity
 from stereokit.result import Disparity, color_range, colorize
 
@@ -136,22 +135,3 @@ def test_a_png_refuses_what_it_cannot_say(tmp_path, value):
         write(tmp_path / "a.pfm")
         np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.pfm"), values)
         (tmp_path / "a.pfm").unlink()
-
-
-def test_images_of_any_range_are_shown_alike():
-    image = np.random.default_rng(0).integers(0, 256, (50, 60, 3)).astype(np.uint8)
-    assert to_display(image) is image
-    for other in (image.astype(np.uint16) * 16, image.astype(np.uint16) * 4 + 300, image.astype(np.float32) / 255,
-                  image.astype(np.float64) * -3.0 * -1 - 1000):  # fmt: skip
-        assert np.abs(to_display(other).astype(int) - image).max() <= 4
-    glare = image.astype(np.float32)
-    glare[0, 0] = 1e9
-    glare[1, 1] = -3.4e38
-    glare[2, 2] = NAN
-    shown = to_display(glare)
-    assert np.abs(shown[3:].astype(int) - image[3:]).max() <= 4
-    assert (shown[0, 0] == 255).all() and (shown[1, 1] == 0).all() and (shown[2, 2] == 0).all()
-    assert (
-        to_display(np.full((2, 2), NAN)).max() == 0
-        and to_display(np.full((2, 2), 9, np.uint16)).min() == 255
-    )

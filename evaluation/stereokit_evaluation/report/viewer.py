@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stereokit.calibration import Calibration
 from stereokit.errors import InputError
-from stereokit.images.display import to_display
+from stereokit.images.intensity import display_8bit
 from stereokit.result import color_range, colorize
 from stereokit_evaluation.report.packing import pack_map, pack_mask
 from stereokit_evaluation.scoring.error_map import COLOURS, EDGES
@@ -127,7 +127,7 @@ def _geometry(calibration: Calibration, width: int, height: int) -> dict[str, fl
 
 def _jpeg(image: NDArray[Any]) -> str:
     """Return an image as a data URI."""
-    image = to_display(image)
+    image = display_8bit(image)
     stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     done, data = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not done:

@@ -200,6 +200,8 @@ def display_8bit(image: Any, nodata: float | None = None) -> NDArray[np.uint8]:
         tone = find_tone(lambda: [(0, plane)], plane.dtype, plane.shape, nodata)
     gray, unknown = tone.apply(plane)
     shown: NDArray[np.uint8] = tone.guide(gray).reshape(colors.shape).copy()
+    if tone.low == tone.high > 0:  # one level: white
+        shown[:] = 255
     if unknown is not None:
         shown.reshape(plane.shape)[unknown] = 0
     if missing is not None:

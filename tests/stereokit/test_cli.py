@@ -389,7 +389,7 @@ def test_paths_are_told_as_they_are(tmp_path, pair):
         (tmp_path / "a[").mkdir(exist_ok=True)
         result = run("match", *pair, "-o", tmp_path / "a[" / name)
         assert result.exit_code == 0, result.output
-        assert name in "".join(result.stdout.split())
+        assert name in "".join(result.stdout.replace("│", "").split())  # the table may break it
         assert (tmp_path / "a[" / name).exists()
     result = run("match", tmp_path / "no[/red].png", pair[1], "-o", tmp_path / "d.pfm")
     assert "no[/red].png" in error_of(result)

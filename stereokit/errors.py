@@ -18,6 +18,7 @@ __all__ = [
     "StereokitWarning",
     "UnknownNameError",
     "did_you_mean",
+    "one_line",
     "shown",
 ]
 
@@ -75,3 +76,18 @@ def did_you_mean(kind: str, name: object, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name.lower(), names, n=1) if isinstance(name, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else "."
     return f"no {kind} named {shown(name)}{hint} Known: {', '.join(names) or 'none'}"
+
+
+def one_line(text: str) -> str:
+    """Return `text` as something that can be printed anywhere, on one line.
+
+    Runs of white space become one blank; control characters, and what stands for the bytes of a file name that is no
+    UTF-8, are written as escapes.
+
+    Parameters
+    ----------
+    text : str
+        Such as a path, or the message of a library.
+    """
+    words = " ".join(text.split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)

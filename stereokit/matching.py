@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.aggregation.contract import Aggregation
+from stereokit.checks import doubts, doubts_about_density
 from stereokit.costs.rows import Cost
 from stereokit.cuda.driver import require_device
 from stereokit.defaults import METHODS
@@ -25,6 +26,7 @@ from stereokit.images.check import check_integer
 from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
+from stereokit.notices import PairWarning, collecting, warn
 from stereokit.pipeline import CpuPipeline, Pipeline
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
@@ -236,17 +238,22 @@ class Matcher:
             ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
             a filled map is `min_disparity` everywhere.
 
+        Warns
+        -----
+        PairWarning
+            If both images are the same, or hardly anything could be measured; see `stereokit.checks`.
+        StereokitWarning
+            If few grey levels hold nearly all pixels of images of more than 8 bits.
+
         Raises
         ------
         InputError
             If the images cannot be used.
-
-        Warns
-        -----
-        StereokitWarning
-            If few grey levels hold nearly all pixels of images of more than 8 bits.
         """
-        return self._call(left, right, self.threads)
+        found = self._call(left, right, self.threads)
+        for line in doubts(left, right, found, self.min_disparity, self.max_disparity):
+            warn(line, PairWarning)
+        return found
 
     def map(
         self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None
@@ -268,6 +275,11 @@ class Matcher:
         ------
         Disparity
 
+        Warns
+        -----
+        PairWarning
+            At the first pair of which hardly anything could be measured.
+
         Raises
         ------
         InputError
@@ -278,6 +290,7 @@ class Matcher:
         # On a GPU each worker has buffers of its own there.
         workers = Workers(self.threads if self.device == "cpu" else min(2, self.threads))
         try:
+            doubted = False
             failure: Exception | None = None  # of the source: what it gave before is still matched
             for done in itertools.count(1):
                 while failure is None and len(ahead) < 2 * self.threads:
@@ -298,6 +311,10 @@ class Matcher:
                     raise failure
                 result = ahead[0].result()
                 ahead.popleft()
+                for line in doubts_about_density(result.density, self.min_disparity, self.max_disparity):
+                    if not doubted:
+                        warn(f"pair {done - 1}: {line}", PairWarning)
+                    doubted = True
                 yield result
                 if progress is not None:
                     progress(done)
@@ -406,7 +423,8 @@ def warmup(*methods: str, max_disparity: int = 128) -> None:
     """
     image = np.arange(16 * 16, dtype=np.uint8).reshape(16, 16)
     for method in methods or METHODS:
-        Matcher(method, max_disparity=max_disparity)(image, image)
+        with collecting():
+            Matcher(method, max_disparity=max_disparity)(image, image)
 
 
 def _forget_matchers() -> None:

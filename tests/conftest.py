@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,6 +44,14 @@ def pytest_collection_modifyitems(items):
         return next((k for k, name in enumerate(LONGEST) if f"{name}.py::" in item.nodeid), len(LONGEST))
 
     items.sort(key=rank)
+
+
+@pytest.fixture(autouse=True)
+def pairs_need_not_be_good():
+    """Let tests match noise, blank images and one image twice; what is warned of is tested with `pytest.warns`."""
+    from stereokit.notices import PairWarning
+
+    warnings.filterwarnings("ignore", category=PairWarning)
 
 
 @pytest.fixture(scope="session")

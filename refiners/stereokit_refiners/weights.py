@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError, did_you_mean
-from stereokit.io import write_bytes
+from stereokit.io import parsing, write_bytes
 from stereokit_refiners.networks.layers import Network, activations, shapes
 from stereokit_refiners.networks.pyramid import Pyramid
 from stereokit_refiners.networks.stereovae import NonVae, StereoVae
@@ -124,25 +125,29 @@ def read(path: str | Path) -> WeightFile:
     """
     library = _library()
     text = str(path)
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise FileError(f"weights must name a file, got {text!r}, which is not there")
-    try:
-        with library.safe_open(text, framework="np") as held:
-            metadata = held.metadata() or {}
-            arrays = {name: held.get_tensor(name) for name in held.keys()}
-    except Exception as error:  # the library raises its own types
-        raise FileError(f"weights must be a safetensors file, got {text!r} ({' '.join(str(error).split())})") from None
+    with (
+        parsing(path, "weights", "weights must be a safetensors file"),
+        library.safe_open(text, framework="np") as held,
+    ):
+        metadata = held.metadata() or {}
+        arrays = {name: held.get_tensor(name) for name in held.keys()}
     if metadata.get("format") != _FORMAT:
         raise FileError(f"weights must have the format {_FORMAT!r}, got {metadata.get('format')!r} in {text!r}")
     name, form = metadata.get("network", ""), metadata.get("form", "")
-    try:
+    with parsing(path, "weights", "weights must hold ranges and notes as JSON"):
         ranges = {str(k): [float(x) for x in v] for k, v in json.loads(metadata.get("ranges", "{}")).items()}
-        notes = dict(json.loads(metadata.get("notes", "{}")))
-    except (ValueError, TypeError, AttributeError):
-        raise FileError(f"weights must hold ranges and notes as JSON, got something else in {text!r}") from None
+        notes = json.loads(metadata.get("notes", "{}"))
+        if not isinstance(notes, dict) or not _are_names(notes.get("frames", [])):
+            raise ValueError("notes are an object, whose frames are names")
     _check(text, name, form, arrays, ranges)
     _check_disparities(text, notes)
     return WeightFile(name, form, arrays, ranges, notes)
+
+
+def _are_names(frames: Any) -> bool:
+    return isinstance(frames, list) and all(isinstance(name, str) for name in frames)
 
 
 def shipped(name: str) -> WeightFile:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.checks import same_pixels
 from stereokit.images.intensity import Tone
 from stereokit.large.plan import Cut, Plan
 from stereokit.large.sources import Source
@@ -42,13 +43,15 @@ class Bands:
     ----------
     measured : int
         Pixels so far that were measured.
+    same : bool
+        Whether both views were the same so far.
     """
 
     def __init__(
         self, matcher: Matcher, sources: tuple[Source, Source], tone: Tone, ranges: Ranges | None, windows: Plan,
         progress: Callable[[int, int], object] | None,
     ) -> None:  # fmt: skip
-        self.measured = 0
+        self.measured, self.same = 0, True
         self._wanted, self._sources, self._tone, self._ranges = matcher, sources, tone, ranges
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
@@ -77,6 +80,7 @@ class Bands:
         """Match one window and put what is kept of it into a band that begins at row `top`."""
         window = row.start, row.stop, column.start, column.stop
         pair = read_pair(*self._sources, self._tone, window, self._ranges)
+        self.same = self.same and same_pixels(pair.left, pair.right)
         found = self._matcher.match_gray(pair, self._matcher.threads)
         kept = slice(column.first - column.start, column.last - column.start)
         rows = slice(top - row.start, top - row.start + len(band))

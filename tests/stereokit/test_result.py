@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from stereokit import io
 from stereokit.calibration import Calibration
 from stereokit.errors import FileError, InputError, OptionError
 from stereokit.io import read_disparity
-from stereokit.result import Disparity, colorize
+from stereokit.result import Disparity, color_range, colorize
 
 NAN = np.nan
 MAP = np.array([[10, 20, NAN], [40, 5, 1]], np.float32)
@@ -128,3 +129,33 @@ def test_a_result_is_told_in_one_line():
     assert repr(result) == "Disparity(2x2, 1.5 .. 40.2 px, 75.0 % measured, confidence)"
     nothing = Disparity(np.full((1, 3), np.nan, np.float32), np.zeros((1, 3), bool))
     assert repr(nothing) == "Disparity(1x3, no disparity, 0.0 % measured)"
+
+
+def test_the_automatic_range_holds_negative_and_far_disparities():
+    spread = np.linspace(0, 127, 4000, dtype=np.float32).reshape(40, 100)
+    for low in (-64, -200, 512, 3000):
+        values = spread + low
+        colors = colorize(values)
+        assert len(np.unique(colors.reshape(-1, 3), axis=0)) > 200
+        assert color_range(values) == pytest.approx((low + 1.27, low + 125.73), abs=0.1)
+    assert color_range(spread) == (0, pytest.approx(125.73, abs=0.1))  # as ever: 0 is dark blue
+    assert color_range(np.full((2, 2), NAN, np.float32)) == (0, 1)
+    assert color_range(np.full((2, 2), 7, np.float32)) == (0, 7)
+    assert color_range(np.full((2, 2), -7, np.float32)) == (-7, -6)
+
+
+@pytest.mark.parametrize("value", [300.5, 256.0, -0.25])
+def test_a_png_refuses_what_it_cannot_say(tmp_path, value):
+    values = np.array([[1, value, NAN]], np.float32)
+    result = Disparity(values, np.isfinite(values))
+    for write in (result.save, lambda path, **options: io.write_disparity(path, values, **options)):
+        with pytest.raises(InputError, match=r"255\.996 px .* clip=True"):
+            write(tmp_path / "a.png")
+        assert not any(tmp_path.iterdir())
+        write(tmp_path / "a.png", clip=True)
+        end = 65535 / 256 if value > 0 else 1 / 256
+        np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.png"), np.float32([[1, end, NAN]]))
+        (tmp_path / "a.png").unlink()
+        write(tmp_path / "a.pfm")
+        np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.pfm"), values)
+        (tmp_path / "a.pfm").unlink()

@@ -16,13 +16,13 @@ import typer
 from matplotlib.figure import Figure
 
 from stereokit import Calibration, Matcher
-from stereokit.cli import app
+from stereokit.cli.app import app
 from stereokit.io import make_folder, write_bytes
 from stereokit.result import Disparity, colorize
-from stereokit_evaluation.demo import Panel, overview
-from stereokit_evaluation.errormap import error_map
-from stereokit_evaluation.metrics import score
-from stereokit_evaluation.scenes import Scene, generate
+from stereokit_evaluation.commands.demo import Panel, overview
+from stereokit_evaluation.scoring.error_map import error_map
+from stereokit_evaluation.scoring.kitti import score
+from stereokit_evaluation.synthetic.scenes import Scene, generate
 
 README = Path(__file__).parents[1] / "README.md"
 WIDTH, HEIGHT, LEVELS, TILE = 828, 250, 96, 414

@@ -6,10 +6,10 @@ import numpy as np
 from distributed import Client, LocalCluster
 
 import stereokit
-from stereokit_evaluation.batch_dask import on_cluster
-from stereokit_evaluation.batch_run import on_threads, run_batch
-from stereokit_evaluation.batch_work import Job
-from stereokit_evaluation.pairs import folder_pairs
+from stereokit_evaluation.batch.dask import on_cluster
+from stereokit_evaluation.batch.job import Job
+from stereokit_evaluation.batch.pairs import folder_pairs
+from stereokit_evaluation.batch.run import on_threads, run_batch
 
 
 def main():

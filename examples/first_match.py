@@ -11,7 +11,7 @@ import stereokit
 if len(sys.argv) == 3:
     left, right = (stereokit.read_image(path) for path in sys.argv[1:])
 else:
-    from stereokit_evaluation.scenes import generate
+    from stereokit_evaluation.synthetic.scenes import generate
 
     scene = generate(seed=0, width=621, height=188, max_disparity=64)
     left, right = scene.left, scene.right

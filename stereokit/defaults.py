@@ -6,7 +6,7 @@ scenes of Middlebury, with one set of options for both. They are chosen by the t
 (MODE_HH, padded) has 8.21 on all frames, and 4.26, 7.28 and 4.69 on the scenes.
 
 D1 noc, percent, pooled over the tuning frames, and in brackets the mean of bad-2.0 nonocc, percent, over cones, teddy
-and Motorcycle (``python -m stereokit_evaluation.search --data DIR --output search.csv``)::
+and Motorcycle (``python -m stereokit_evaluation.commands.search --data DIR --output search.csv``)::
 
     S1 census+dt: tuning 5.70, validation 4.92, all 5.45; cones 3.34, teddy 4.87, Motorcycle 4.35
       smooth      0: 6.13 (4.41); 0.5: 5.98 (4.03); 0.6: 5.75 (4.04); 0.7: 5.70 (4.19); 0.8: 5.71 (4.38);

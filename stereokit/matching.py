@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Levels, Pair
+from stereokit.cuda.driver import has_device, require_device
 from stereokit.defaults import METHODS, defaults_of
 from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
-from stereokit.inputs import (
+from stereokit.images.gray import (
     GrayPair,
     check_flag,
     check_integer,
@@ -32,8 +33,7 @@ from stereokit.inputs import (
     half_size,
     smooth,
 )
-from stereokit.kernels.device import has_device, require_device
-from stereokit.kernels.pool import available_threads, crew
+from stereokit.kernels.threads import available_threads, crew
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.methods import check_levels, find_refiner, option_names, parse_method
 from stereokit.postprocess.chain import Chain, post_process
@@ -43,7 +43,7 @@ from stereokit.result import Disparity
 from stereokit.selection.wta import winners_like
 
 if TYPE_CHECKING:
-    from stereokit.pipeline_cuda import CudaPipeline, DeviceDisparity, Settings
+    from stereokit.cuda.pipeline import CudaPipeline, DeviceDisparity, Settings
 
 __all__ = ["METHODS", "Matcher", "match", "warmup"]
 
@@ -145,7 +145,7 @@ class Matcher:
             self._set_device(fall_back=device == "auto")
 
     def _set_device(self, fall_back: bool) -> None:
-        from stereokit.pipeline_cuda import CudaPipeline  # numba.cuda is imported late
+        from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
 
         try:
             self._cuda = CudaPipeline(self._cuda_settings(), getattr(self._refine, "on_device", None))
@@ -155,8 +155,8 @@ class Matcher:
                 raise
 
     def _cuda_settings(self) -> Settings:
-        """Return what `stereokit.pipeline_cuda` needs to know."""
-        from stereokit.pipeline_cuda import Settings
+        """Return what `stereokit.cuda.pipeline` needs to know."""
+        from stereokit.cuda.pipeline import Settings
 
         return Settings(
             self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
@@ -226,7 +226,7 @@ class Matcher:
 
         Returns
         -------
-        stereokit.pipeline_cuda.DeviceDisparity
+        stereokit.cuda.pipeline.DeviceDisparity
             Arrays with ``__cuda_array_interface__``: ``torch.as_tensor(result.disparity)`` takes one without a copy.
 
         Raises

@@ -16,7 +16,7 @@ from stereokit.aggregation import sgm as _sgm  # noqa: F401
 from stereokit.costs.rows import Levels
 from stereokit.defaults import METHODS
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean
-from stereokit.inputs import MAX_DISPARITY, check_integer, check_names
+from stereokit.images.gray import MAX_DISPARITY, check_integer, check_names
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 
 __all__ = ["build_aggregation", "build_cost", "check_levels", "find_refiner", "option_names", "parse_method"]

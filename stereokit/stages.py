@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume
 from stereokit.errors import InputError, OptionError
-from stereokit.inputs import check_integer, check_number, gray_pair, writable
-from stereokit.inputs import smooth as smoothed
-from stereokit.kernels.pool import available_threads
+from stereokit.images.gray import check_integer, check_number, gray_pair, writable
+from stereokit.images.gray import smooth as smoothed
+from stereokit.kernels.threads import available_threads
 from stereokit.kernels.workspace import Workspace
 from stereokit.methods import build_aggregation, build_cost, check_levels
 from stereokit.selection.wta import winners_like

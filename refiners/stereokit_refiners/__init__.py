@@ -3,9 +3,9 @@
 Importing this package imports neither torch nor any runtime: they are loaded when a refiner needs them.
 """
 
+from stereokit_refiners.contract import Refiner
+from stereokit_refiners.learned import CnnRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
 from stereokit_refiners.linear import Linear
-from stereokit_refiners.network import CnnRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
-from stereokit_refiners.refiner import Refiner
 from stereokit_refiners.weights import WeightFile
 
 __all__ = [

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.result import Disparity
-from stereokit_refiners.refiner import on_tensors
+from stereokit_refiners.contract import on_tensors
 
 if TYPE_CHECKING:
-    from stereokit.pipeline_cuda import DeviceDisparity
+    from stereokit.cuda.pipeline import DeviceDisparity
 
 __all__ = ["Linear"]
 
@@ -27,7 +27,7 @@ class Linear:
     """Bilinear upscaling by two; the left image is used for its size only."""
 
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
-        """Return the map at the size of `left`; see `stereokit_refiners.refiner.Refiner`."""
+        """Return the map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
         height, width = left.shape
 
         def upscale(image: NDArray[Any], method: int) -> NDArray[Any]:
@@ -45,6 +45,6 @@ class Linear:
         return Disparity(disparity, valid, confidence)
 
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
-        """Return the map at the size of `left`, on the GPU; see `stereokit_refiners.refiner.DeviceRefiner`."""
+        """Return the map at the size of `left`, on the GPU; see `stereokit_refiners.contract.DeviceRefiner`."""
         found: tuple[Any, Any, Any] = on_tensors().linear_on_device(coarse, left, stream)
         return found

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError, did_you_mean
 from stereokit.io import write_bytes
-from stereokit_refiners.layers import Network, activations, shapes
-from stereokit_refiners.pyramid import Pyramid
-from stereokit_refiners.stereovae import NonVae, StereoVae
+from stereokit_refiners.networks.layers import Network, activations, shapes
+from stereokit_refiners.networks.pyramid import Pyramid
+from stereokit_refiners.networks.stereovae import NonVae, StereoVae
 
 __all__ = ["NETWORKS", "WeightFile", "network_named", "read", "shipped", "write"]
 

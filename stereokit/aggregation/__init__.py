@@ -1,1 +1,3 @@
 """Cost aggregation: each sweeps over the rows that a cost produces."""
+
+__all__: list[str] = []

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stereokit.aggregation.dt import Dt
-from stereokit.kernels.cuda import Kernel, Queue, array, blocks_for, cuda, f32, i16, i32, kernel, u8, u32
+from stereokit.cuda.kernel import Kernel, Queue, array, blocks_for, cuda, f32, i16, i32, kernel, u8, u32
 
 __all__ = ["SEGMENT", "bands", "marks_of", "weights"]
 

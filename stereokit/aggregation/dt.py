@@ -36,9 +36,8 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, cost_row
 from stereokit.errors import OptionError
-from stereokit.inputs import check_integer, check_number
+from stereokit.images.gray import check_integer, check_number
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.pool import run, spans
 from stereokit.kernels.simd import (
     LANES,
     add,
@@ -53,6 +52,7 @@ from stereokit.kernels.simd import (
     store,
     subtract,
 )
+from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, keys_of, select_pixel

@@ -24,7 +24,7 @@ from stereokit.aggregation._lines_cuda import SEGMENT, bands, marks_of, weights
 from stereokit.aggregation.dt import Dt
 from stereokit.aggregation.dt_sum_cuda import aggregate_sum
 from stereokit.costs.rows import Cost
-from stereokit.kernels.cuda import (
+from stereokit.cuda.kernel import (
     Kernel,
     Queue,
     array,

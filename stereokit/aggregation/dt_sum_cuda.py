@@ -14,7 +14,7 @@ import numpy as np
 
 from stereokit.aggregation._lines_cuda import SEGMENT, bands, marks_of, weights
 from stereokit.aggregation.dt import Dt
-from stereokit.kernels.cuda import Queue, array, blocks_for, cuda, device, f32, kernel, u8, u32
+from stereokit.cuda.kernel import Queue, array, blocks_for, cuda, device, f32, kernel, u8, u32
 from stereokit.selection.wta_cuda import Maps, select
 
 __all__ = ["aggregate_sum"]

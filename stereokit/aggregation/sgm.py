@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from stereokit.aggregation._paths import CHUNK, PathBuffers, Penalties, finish_part, first_visit, prepare_rows, start
 from stereokit.costs.rows import WORST, Cost, Levels
 from stereokit.errors import OptionError
-from stereokit.inputs import check_integer, check_number
+from stereokit.images.gray import check_integer, check_number
 from stereokit.kernels.jit import kernel
-from stereokit.kernels.pool import run_stages
 from stereokit.kernels.simd import LANES, load, store
+from stereokit.kernels.threads import run_stages
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, select_row

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from stereokit.aggregation._paths import Penalties
 from stereokit.aggregation.sgm import Sgm
 from stereokit.costs.rows import Cost
-from stereokit.kernels.cuda import (
+from stereokit.cuda.kernel import (
     Kernel,
     Queue,
     array,

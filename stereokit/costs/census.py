@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements, pad_pair
 from stereokit.errors import OptionError
 from stereokit.kernels.jit import kernel
-from stereokit.kernels.pool import run, spans
 from stereokit.kernels.simd import LANES, add, count_bits, either, less_bit, load, splat, store, xor
+from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import COSTS
 

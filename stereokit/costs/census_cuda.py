@@ -13,8 +13,8 @@ import numpy as np
 
 from stereokit.costs.census import WINDOWS, Census
 from stereokit.costs.rows_cuda import EVIDENCE, Scene, held, masked_cost, padding
-from stereokit.inputs_cuda import KINDS, clamped
-from stereokit.kernels.cuda import Kernel, Queue, array, blocks_for, cuda, i32, kernel, u32
+from stereokit.cuda.kernel import Kernel, Queue, array, blocks_for, cuda, i32, kernel, u32
+from stereokit.images.prepare_cuda import KINDS, clamped
 
 __all__ = ["bits_kernel", "costs_kernel", "volume"]
 

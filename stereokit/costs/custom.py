@@ -14,8 +14,8 @@ import numpy as np
 
 from stereokit.costs.rows import Pair, VolumeRows
 from stereokit.errors import OptionError
-from stereokit.inputs import check_integer
-from stereokit.kernels.pool import run, spans
+from stereokit.images.gray import check_integer
+from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
 __all__ = ["RowCost"]

@@ -30,8 +30,8 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.pool import run, spans
 from stereokit.kernels.simd import LANES, either, load, maximum, minimum, splat, store
+from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
 __all__ = [

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from stereokit.costs.rows import Levels
-from stereokit.inputs_cuda import clamped
-from stereokit.kernels.cuda import array, device, i32, u8, u32
+from stereokit.cuda.kernel import array, device, i32, u8, u32
+from stereokit.images.prepare_cuda import clamped
 
 __all__ = ["EVIDENCE", "Scene", "held", "masked_cost", "pad_levels", "padding"]
 

@@ -35,9 +35,8 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements
 from stereokit.errors import OptionError
-from stereokit.inputs import check_integer
+from stereokit.images.gray import check_integer
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.pool import run_stages, spans
 from stereokit.kernels.simd import (
     LANES,
     add,
@@ -52,6 +51,7 @@ from stereokit.kernels.simd import (
     store,
     subtract,
 )
+from stereokit.kernels.threads import run_stages, spans
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import COSTS
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from stereokit.costs.rows_cuda import EVIDENCE, Scene, held, masked_cost, padding
 from stereokit.costs.zncc import Zncc
+from stereokit.cuda.kernel import Kernel, Queue, array, blocks_for, cuda, f32, i16, i32, kernel, u32
 from stereokit.errors import DeviceError
-from stereokit.inputs_cuda import KINDS, clamped, ranges
-from stereokit.kernels.cuda import Kernel, Queue, array, blocks_for, cuda, f32, i16, i32, kernel, u32
+from stereokit.images.prepare_cuda import KINDS, clamped, ranges
 
 __all__ = ["LARGEST_WINDOW", "centre_kernel", "check_window", "costs_kernel", "statistics", "volume"]
 

@@ -3,7 +3,7 @@
 Every kernel is compiled on first use for the types that it meets, kept in numba's disk cache, releases the
 interpreter lock so that plain threads run it side by side, and divides as numpy does (no zero-division
 exception inside loops). There is no ``fastmath``: results must not depend on the processor. There is no
-``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.pool` runs
+``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.threads` runs
 several of them at once, which is safe from any number of calling threads and compiles in half the time.
 
 Numba files a compiled kernel under the name of its function and looks only at the file which that stands in, not

@@ -18,7 +18,7 @@ from typing import Any
 
 from stereokit.costs import Zncc
 from stereokit.errors import InputError, OptionError
-from stereokit.inputs import GrayPair, check_integer
+from stereokit.images.gray import GrayPair, check_integer
 from stereokit.kernels.workspace import Workspace
 from stereokit.large.bands import Bands
 from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes, window_model

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stereokit.errors import OptionError
-from stereokit.inputs import GrayPair
+from stereokit.images.gray import GrayPair
 from stereokit.kernels.workspace import Workspace
 
 __all__ = ["free_nbytes", "parse_memory", "resident_nbytes", "window_model"]

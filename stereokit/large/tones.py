@@ -1,4 +1,4 @@
-"""Grey values that are the same in every window: what `stereokit.inputs.gray_pair` decides from the whole images.
+"""Grey values that are the same in every window: what `stereokit.images.gray.gray_pair` decides from the whole images.
 
 Floating-point images are brought to 16 bits over the range of both images, 16-bit ones to the guide's 256 levels. A
 window alone knows neither range; one pass over the images, a block of rows at a time, finds them first. Images of
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.inputs import GrayPair, fill_bad, half_size, scale_guide, scale_to_16_bits, smooth, to_gray
+from stereokit.images.gray import GrayPair, fill_bad, half_size, scale_guide, scale_to_16_bits, smooth, to_gray
 from stereokit.large.sources import Source
 
 __all__ = ["BLOCK_NBYTES", "Tone", "find_ranges", "find_tone", "read_pair"]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.kernels.pool import run_stages, spans
+from stereokit.kernels.threads import run_stages, spans
 from stereokit.kernels.workspace import Workspace
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.kernels.cuda import Queue, array, blocks_for, cuda, f32, kernel, u8, u32
+from stereokit.cuda.kernel import Queue, array, blocks_for, cuda, f32, kernel, u8, u32
 from stereokit.postprocess.chain import Chain
 from stereokit.postprocess.fill_cuda import fill
 from stereokit.postprocess.median_cuda import median

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, UnknownNameError, did_you_mean
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.pool import run, spans
+from stereokit.kernels.threads import run, spans
 
 __all__ = ["FILLS", "fill", "fill_empty_rows", "fill_rows", "gap_value"]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.kernels.cuda import FULL, Queue, array, blocks_for, cuda, f32, i32, kernel, u8, u32
+from stereokit.cuda.kernel import FULL, Queue, array, blocks_for, cuda, f32, i32, kernel, u8, u32
 from stereokit.postprocess.fill import gap_value
 
 __all__ = ["fill"]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.kernels.cuda import Kernel, Queue, array, blocks_for, cuda, device, f32, i32, kernel, u32
+from stereokit.cuda.kernel import Kernel, Queue, array, blocks_for, cuda, device, f32, i32, kernel, u32
 
 __all__ = ["median"]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.pool import run, spans
+from stereokit.kernels.threads import run, spans
 
 __all__ = ["resolve_rows", "right_column", "single_matching_phase"]
 

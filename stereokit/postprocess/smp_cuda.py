@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.kernels.cuda import Kernel, Queue, array, cuda, device, f32, kernel, u16, u32, u64
+from stereokit.cuda.kernel import Kernel, Queue, array, cuda, device, f32, kernel, u16, u32, u64
 from stereokit.postprocess.smp import right_column
 
 __all__ = ["resolve"]

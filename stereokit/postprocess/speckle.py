@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.inputs import check_integer, check_number
+from stereokit.images.gray import check_integer, check_number
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.pool import run, spans
+from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
 __all__ = ["alike", "erase", "find_regions", "join_rows", "remove_speckles"]

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.kernels.cuda import (
+from stereokit.cuda.kernel import (
     FULL,
     Queue,
     array,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.inputs import MAX_DISPARITY, check_flag, check_integer
+from stereokit.images.gray import MAX_DISPARITY, check_flag, check_integer
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.simd import LANES, choose, first_bit, load, lowest, mask_equal, minimum, splat
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereokit.kernels.cuda import (
+from stereokit.cuda.kernel import (
     FULL,
     Kernel,
     Queue,

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from stereokit.errors import StereokitError
 from stereokit.io import write_image
-from stereokit_evaluation.batch import batch
+from stereokit_evaluation.commands.batch import batch
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("--method", "S2", "--max-disparity", "16")
@@ -56,7 +56,7 @@ def refused(*words):
 
 def start(*words, folder):
     """Start the command in a process of its own, its output in files of `folder`."""
-    code = "from stereokit.cli import main; main()"
+    code = "from stereokit.cli.app import main; main()"
     with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as err:
         return subprocess.Popen(
             [sys.executable, "-c", code, "batch", *map(str, words), *SMALL], stdout=out, stderr=err, env=environment()

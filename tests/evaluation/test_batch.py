@@ -18,13 +18,14 @@ from batches import images, inodes, refused, run, start, wait_for, write_pairs
 import stereokit
 from stereokit.errors import FileError
 from stereokit.io import read_disparity, write_image
-from stereokit_evaluation import batch_run, batch_work
-from stereokit_evaluation.batch import find_pairs
-from stereokit_evaluation.batch_run import Summary, on_threads, run_batch
-from stereokit_evaluation.batch_store import held, publish
-from stereokit_evaluation.batch_work import Job, Outcome
-from stereokit_evaluation.pairs import Pair, folder_pairs, list_pairs
-from stereokit_evaluation.video_pairs import Video
+from stereokit_evaluation.batch import job as batch_job
+from stereokit_evaluation.batch import run as batch_run
+from stereokit_evaluation.batch.job import Job, Outcome
+from stereokit_evaluation.batch.pairs import Pair, folder_pairs, list_pairs
+from stereokit_evaluation.batch.run import Summary, on_threads, run_batch
+from stereokit_evaluation.batch.store import held, publish
+from stereokit_evaluation.batch.video import Video
+from stereokit_evaluation.commands.batch import find_pairs
 
 # What the inputs are
 
@@ -242,7 +243,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
 
 def test_a_full_disk_ends_the_run_and_keeps_what_is_there(tmp_path, monkeypatch):
     write_pairs(tmp_path, [f"{k:02d}" for k in range(20)])
-    real, calls = batch_work.write_disparity, []
+    real, calls = batch_job.write_disparity, []
 
     def write(path, disparity):
         calls.append(path)
@@ -250,12 +251,12 @@ def test_a_full_disk_ends_the_run_and_keeps_what_is_there(tmp_path, monkeypatch)
             raise FileError("cannot write: No space left on device") from OSError(errno.ENOSPC, "full")
         real(path, disparity)
 
-    monkeypatch.setattr(batch_work, "write_disparity", write)
+    monkeypatch.setattr(batch_job, "write_disparity", write)
     line = refused(tmp_path, "-o", tmp_path / "out", "--workers", "1")
     assert "No space left" in line and "3 maps were written" in line
     assert len(calls) < 10 and len(inodes(tmp_path / "out")) == 3
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["stopped"] is not None
-    monkeypatch.setattr(batch_work, "write_disparity", real)
+    monkeypatch.setattr(batch_job, "write_disparity", real)
     assert run(tmp_path, "-o", tmp_path / "out")["written"] == 17
 
 

@@ -12,9 +12,9 @@ import pytest
 from batches import environment, images, inodes, refused, run, start, wait_for, write_pairs
 
 from stereokit.io import read_disparity
-from stereokit_evaluation.batch_dask import connect, on_cluster
-from stereokit_evaluation.batch_work import Job
-from stereokit_evaluation.pairs import folder_pairs
+from stereokit_evaluation.batch.dask import connect, on_cluster
+from stereokit_evaluation.batch.job import Job
+from stereokit_evaluation.batch.pairs import folder_pairs
 
 pytest.importorskip("distributed", reason="Dask's distributed is not installed: pip install 'stereokit[dask]'")
 
@@ -138,7 +138,7 @@ def test_frames_of_a_video_are_sent(cluster, tmp_path):
 
 
 def test_a_scheduler_that_does_not_answer_is_refused(tmp_path, monkeypatch):
-    from stereokit_evaluation import batch_dask
+    from stereokit_evaluation.batch import dask as batch_dask
 
     monkeypatch.setattr(batch_dask, "_CONNECT_S", 1)
     write_pairs(tmp_path, ["0"])

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from stereokit.calibration import Calibration
-from stereokit_evaluation import viewer
-from stereokit_evaluation.report import render
+from stereokit_evaluation.report import viewer
+from stereokit_evaluation.report.page import render
 
 pytestmark = pytest.mark.browser
 ARGUMENTS = (
@@ -51,8 +51,8 @@ def study_file(tmp_path_factory):
     from typer import Typer
     from typer.testing import CliRunner
 
-    from stereokit_evaluation import datasets
-    from stereokit_evaluation.study import study
+    from stereokit_evaluation.commands.study import study
+    from stereokit_evaluation.data import datasets
 
     out, app = tmp_path_factory.mktemp("study"), Typer()
     app.command()(study)
@@ -240,7 +240,7 @@ def test_the_keyboard_moves_the_cursor_and_turns_the_cloud(chromium, view_file):
 
 
 def test_errors_have_the_colours_of_the_benchmark(chromium, view_file):
-    from stereokit_evaluation.errormap import error_map
+    from stereokit_evaluation.scoring.error_map import error_map
 
     with opened(chromium, view_file) as page:
         slide(page, 100)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from stereokit.errors import FileError, OptionError, UnknownNameError
-from stereokit_evaluation import datasets
-from stereokit_evaluation.frames import Frame, select
+from stereokit_evaluation.data import datasets
+from stereokit_evaluation.data.frame import Frame, select
 
 DATA = Path(os.environ.get("STEREOKIT_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 NAN = np.nan
@@ -243,7 +243,7 @@ def test_scenes_are_adapted_and_drawn_once(monkeypatch):
         image = np.full((height, width), index, np.uint8)
         return SimpleNamespace(left=image, right=image + 1, occ=occ, noc=noc, objects=image)
 
-    monkeypatch.setitem(sys.modules, "stereokit_evaluation.scenes", SimpleNamespace(generate=generate))
+    monkeypatch.setitem(sys.modules, "stereokit_evaluation.synthetic.scenes", SimpleNamespace(generate=generate))
     datasets._scene.cache_clear()
     frames = datasets.load("scenes", count=3)
     assert [frame.name for frame in frames] == ["scene_000", "scene_001", "scene_002"] and not drawn
@@ -255,7 +255,7 @@ def test_scenes_are_adapted_and_drawn_once(monkeypatch):
 
 
 def test_scenes():
-    pytest.importorskip("stereokit_evaluation.scenes", exc_type=ImportError)
+    pytest.importorskip("stereokit_evaluation.synthetic.scenes", exc_type=ImportError)
     frames = datasets.load("scenes", count=2)
     assert len(frames) == 2 and [f.name for f in select(frames, "1")] == [frames[1].name]
     frame = frames[1]

@@ -13,8 +13,8 @@ pytest.importorskip("skimage")
 
 import stereokit
 from stereokit.errors import FileError, InputError, OptionError, StereokitError
-from stereokit_evaluation import demo as module
-from stereokit_evaluation.demo import Panel, demo, overview
+from stereokit_evaluation.commands import demo as module
+from stereokit_evaluation.commands.demo import Panel, demo, overview
 
 METHODS = {"S1": "census+dt", "S4": "zncc+sgm"}
 WHITE = np.full((50, 100, 3), 255, np.uint8)

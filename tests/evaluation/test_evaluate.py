@@ -13,10 +13,10 @@ import typer
 from typer.testing import CliRunner
 
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
-from stereokit_evaluation import datasets
-from stereokit_evaluation.evaluate import evaluate, run
-from stereokit_evaluation.frames import Frame
-from stereokit_evaluation.runner import Skipped, score_frames, with_matcher
+from stereokit_evaluation.commands.evaluate import evaluate, run
+from stereokit_evaluation.data import datasets
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.scoring.runner import Skipped, score_frames, with_matcher
 
 SHAPE = (8, 12)
 WORKERS = typer.Typer()
@@ -351,7 +351,7 @@ def test_help_names_the_options():
 
 
 def test_frames_that_a_refiner_was_trained_on_are_told_of():
-    from stereokit_evaluation.runner import seen_in_training
+    from stereokit_evaluation.scoring.runner import seen_in_training
 
     frames = [Frame(name, Path("l"), Path("r")) for name in ("a", "b", "c")]
     refiner = SimpleNamespace(trained_on=frozenset({"set/a", "set/c", "other/b"}))

@@ -12,15 +12,17 @@ import pytest
 from typer.testing import CliRunner
 
 from stereokit import Matcher
-from stereokit.cli import app
+from stereokit.cli.app import app
+from stereokit.cuda.driver import has_device
 from stereokit.errors import DeviceError
-from stereokit.kernels.device import has_device
-from stereokit_evaluation import _gpu_code, _gpu_report, gpu_model
-from stereokit_evaluation._gpu_code import Code, Resources, outer_loops, parse_sass, warps_that_fit
-from stereokit_evaluation._gpu_work import Work
-from stereokit_evaluation._sizes import Size
-from stereokit_evaluation.gpu_machines import MACHINES, Machine, libsgm_bytes
-from stereokit_evaluation.gpu_model import Launch, modelled
+from stereokit_evaluation.common.sizes import Size
+from stereokit_evaluation.gpu_model import model as gpu_model
+from stereokit_evaluation.gpu_model import sass
+from stereokit_evaluation.gpu_model import table as gpu_report
+from stereokit_evaluation.gpu_model.machines import MACHINES, Machine, libsgm_bytes
+from stereokit_evaluation.gpu_model.model import Launch, modelled
+from stereokit_evaluation.gpu_model.sass import Code, Resources, outer_loops, parse_sass, warps_that_fit
+from stereokit_evaluation.gpu_model.work import Work
 
 SASS = """
         .section        .text.kernel
@@ -124,8 +126,8 @@ def test_libsgm_writes_and_reads_each_path():
 
 def test_machines_have_what_the_model_needs():
     for machine in MACHINES:
-        assert machine.architecture in _gpu_code.ARCHITECTURES and machine.source
-        assert set(machine.rates) == set(_gpu_code.UNITS)
+        assert machine.architecture in sass.ARCHITECTURES and machine.source
+        assert set(machine.rates) == set(sass.UNITS)
 
 
 # launches
@@ -155,8 +157,8 @@ def test_what_is_not_known_is_refused(kernels):
 @pytest.mark.parametrize("method", ["S2", "S4"])
 def test_full_size_moves_at_most_half_more_than_libsgm(kernels, method):
     size = Size("K", 1242, 375, 128)
-    matcher, launches = _gpu_report.launches_of([method], size, 1)[method]
-    match = _gpu_report.Match(method, size, 1, 128, 4, launches, [], {})
+    matcher, launches = gpu_report.launches_of([method], size, 1)[method]
+    match = gpu_report.Match(method, size, 1, 128, 4, launches, [], {})
     assert match.pixels == 1242 * 375 and matcher.aggregation.paths == 4
     assert 1.3 < match.of_libsgm < 1.5
     assert match.moved < 1.6 * libsgm_bytes(match.pixels, 128, 4)  # of all other launches too
@@ -168,10 +170,10 @@ def test_full_size_moves_at_most_half_more_than_libsgm(kernels, method):
 @pytest.fixture
 def assembled(monkeypatch, kernels):
     """Let every kernel be ten instructions, without a compiler."""
-    monkeypatch.setattr(_gpu_code, "tool", lambda name: name)
+    monkeypatch.setattr(sass, "tool", lambda name: name)
     code = Code(("memory",) * 2 + ("integer",) * 8, ())
-    monkeypatch.setattr(_gpu_report, "code_of", lambda ptx, architecture: (code, Resources(32, 0, 0)))
-    from stereokit.kernels.cuda import Kernel
+    monkeypatch.setattr(gpu_report, "code_of", lambda ptx, architecture: (code, Resources(32, 0, 0)))
+    from stereokit.cuda.kernel import Kernel
 
     monkeypatch.setattr(Kernel, "ptx", lambda kernel, capability: "")
 
@@ -207,7 +209,7 @@ def test_json_has_every_launch_and_its_sum(assembled):
 
 
 def test_without_the_tools_it_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(_gpu_code, "tool", lambda name: None)
+    monkeypatch.setattr(sass, "tool", lambda name: None)
     done = bench("--model", "--sizes", "101x50x32")
     assert done.exit_code == 2 and not done.stdout
     assert "pip install 'stereokit[cuda-test]'" in done.stderr and done.stderr.count("\n") == 1
@@ -218,9 +220,9 @@ def test_a_tool_that_fails_is_told_in_one_line(monkeypatch, tmp_path):
     tool = tmp_path / "ptxas"
     tool.write_text("#!/bin/sh\necho 'ptxas fatal: no such target' >&2\nexit 1\n")
     tool.chmod(0o755)
-    monkeypatch.setattr(_gpu_code, "tool", lambda name: tool)
+    monkeypatch.setattr(sass, "tool", lambda name: tool)
     with pytest.raises(DeviceError, match=r"^ptxas must take the kernel, but it says: ptxas fatal: no such target$"):
-        _gpu_code.resources("", "sm_72")
+        sass.resources("", "sm_72")
 
 
 def test_the_model_looks_at_no_images(tmp_path):

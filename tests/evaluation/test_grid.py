@@ -10,8 +10,15 @@ import pytest
 
 from stereokit.errors import FileError, OptionError, UnknownNameError
 from stereokit.registry import REFINERS
-from stereokit_evaluation import grid
-from stereokit_evaluation.grid import build, describe_error, parse_setting, peer, settings_at_hand, title
+from stereokit_evaluation.study import configurations
+from stereokit_evaluation.study.configurations import (
+    build,
+    describe_error,
+    parse_setting,
+    peer,
+    settings_at_hand,
+    title,
+)
 from stereokit_refiners import Linear
 
 
@@ -107,7 +114,7 @@ def test_identities_hold_no_addresses():
     class Plain:
         pass
 
-    assert " at 0x" not in grid._stable(Plain())
+    assert " at 0x" not in configurations._stable(Plain())
     again = [identities(build(["S1", "S4"], ["linear", "original"], {})) for _ in range(2)]
     assert again[0] == again[1]
 
@@ -145,11 +152,11 @@ def test_a_weight_file_is_a_setting(tmp_path):
 def test_fingerprints_follow_content(tmp_path):
     (tmp_path / "a.py").write_text("1")
     (tmp_path / "w.bin").write_text("1")
-    source, everything = grid.fingerprint(tmp_path), grid.fingerprint(tmp_path, everything=True)
-    grid.fingerprint.cache_clear()
+    source, everything = configurations.fingerprint(tmp_path), configurations.fingerprint(tmp_path, everything=True)
+    configurations.fingerprint.cache_clear()
     (tmp_path / "w.bin").write_text("2")
-    assert grid.fingerprint(tmp_path) == source
-    assert grid.fingerprint(tmp_path, everything=True) != everything
+    assert configurations.fingerprint(tmp_path) == source
+    assert configurations.fingerprint(tmp_path, everything=True) != everything
 
 
 def test_a_module_of_its_own_is_its_file_and_not_the_folder_around_it(tmp_path, monkeypatch):
@@ -157,13 +164,13 @@ def test_a_module_of_its_own_is_its_file_and_not_the_folder_around_it(tmp_path, 
     (tmp_path / "neighbour.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     made = importlib.import_module("lone_refiner").Lone()
-    before = grid._weights(made)
-    grid.fingerprint.cache_clear()
+    before = configurations._weights(made)
+    configurations.fingerprint.cache_clear()
     (tmp_path / "neighbour.py").write_text("changed = True")
-    assert grid._weights(made) == before
-    grid.fingerprint.cache_clear()
+    assert configurations._weights(made) == before
+    configurations.fingerprint.cache_clear()
     (tmp_path / "lone_refiner.py").write_text("class Lone:\n    changed = True\n")
-    assert grid._weights(made) != before
+    assert configurations._weights(made) != before
 
 
 def test_errors_are_one_line():

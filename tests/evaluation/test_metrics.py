@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereokit.errors import InputError, OptionError
-from stereokit_evaluation.errormap import COLOURS, error_map
-from stereokit_evaluation.metrics import (
+from stereokit_evaluation.scoring.error_map import COLOURS, error_map
+from stereokit_evaluation.scoring.kitti import (
     Counts,
     Regions,
     Score,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from stereokit.errors import InputError
-from stereokit_evaluation.packing import STEPS, pack_map, pack_mask, unpack_map, unpack_mask
+from stereokit_evaluation.report.packing import STEPS, pack_map, pack_mask, unpack_map, unpack_mask
 
 SHAPES = st.tuples(st.integers(1, 9), st.integers(1, 9))
 VALUES = st.one_of(st.floats(-50, 2000, width=32), st.just(float("nan")), st.just(float("inf")))

@@ -11,12 +11,13 @@ from typer.testing import CliRunner
 
 from stereokit.errors import OptionError
 from stereokit.registry import REFINERS
-from stereokit_evaluation import pipeline, speed
-from stereokit_evaluation._sizes import Size
+from stereokit_evaluation.commands import bench
+from stereokit_evaluation.common.sizes import Size
+from stereokit_evaluation.study import table2 as pipeline
 from stereokit_refiners import Linear
 
 APP = typer.Typer()
-APP.command()(speed.bench)
+APP.command()(bench.bench)
 TINY = "96x32x16"
 
 

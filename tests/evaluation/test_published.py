@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereokit_evaluation import published
+from stereokit_evaluation.data import published
 
 TABLE = {system.name: system for system in published.TABLE_3}
 

@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 from stereokit.calibration import Calibration
 from stereokit.errors import FileError, InputError, OptionError, StereokitError
 from stereokit.io import write_disparity
-from stereokit_evaluation import charts, datasets, report, viewer
-from stereokit_evaluation.packing import unpack_map, unpack_mask
-from stereokit_evaluation.report import chosen_frames, render
-from stereokit_evaluation.study import study
-from stereokit_evaluation.view import view
+from stereokit_evaluation.commands.study import study
+from stereokit_evaluation.commands.view import view
+from stereokit_evaluation.data import datasets
+from stereokit_evaluation.report import charts, page, viewer
+from stereokit_evaluation.report.packing import unpack_map, unpack_mask
+from stereokit_evaluation.report.page import chosen_frames, render
 
 pytest.importorskip("jinja2")
 plotly = pytest.importorskip("plotly.graph_objects")
@@ -159,7 +160,7 @@ def test_a_missing_package_is_one_line(monkeypatch):
     def gone(name):
         raise ModuleNotFoundError(name=name)
 
-    monkeypatch.setattr(report, "import_module", gone)
+    monkeypatch.setattr(page, "import_module", gone)
     with pytest.raises(StereokitError, match=r'a report needs jinja2: pip install "stereokit\[report\]"'):
         render("view.html.j2", [])
 

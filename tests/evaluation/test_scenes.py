@@ -10,10 +10,10 @@ import pytest
 pytest.importorskip("skimage")
 
 from stereokit.errors import OptionError, StereokitError
-from stereokit_evaluation import _textures, scenes
-from stereokit_evaluation._geometry import Camera, Patch, covers, occlusion, plane_of, rasterise
-from stereokit_evaluation._textures import Decal, Look, Texture, paint
-from stereokit_evaluation.scenes import CAMERA_HEIGHT_M, generate
+from stereokit_evaluation.synthetic import scenes, textures
+from stereokit_evaluation.synthetic.geometry import Camera, Patch, covers, occlusion, plane_of, rasterise
+from stereokit_evaluation.synthetic.scenes import CAMERA_HEIGHT_M, generate
+from stereokit_evaluation.synthetic.textures import Decal, Look, Texture, paint
 
 PLAIN = {"noise": 0.0, "gain": 1.0, "offset": 0.0, "blur": 0.0, "hard_cases": False}
 GREY = Look((128.0, 128.0, 128.0))
@@ -234,9 +234,9 @@ def test_bad_options_are_named(options, message):
 
 def test_without_the_photographs_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage", None)
-    _textures.photograph.cache_clear()
+    textures.photograph.cache_clear()
     with pytest.raises(StereokitError, match=r"pip install stereokit\[evaluation\]"):
-        _textures.photograph("brick")
+        textures.photograph("brick")
 
 
 def test_a_texture_is_linear_between_pixels_and_averages_far_away():

@@ -11,14 +11,17 @@ import pytest
 from typer.testing import CliRunner
 
 from stereokit import matching
-from stereokit.cli import app
+from stereokit.cli.app import app
 from stereokit.errors import OptionError, StereokitError, UnknownNameError
-from stereokit_evaluation import _peers, _progress, _speed_report, speed
-from stereokit_evaluation._probes import ProbeError, first_call, memory_added, stored
-from stereokit_evaluation._rounds import ratio, round_robin, spread
-from stereokit_evaluation._sizes import SIZES, Size, parse_sizes, parse_threads
-from stereokit_evaluation._speed_report import Findings, as_json, print_tables
-from stereokit_evaluation._stage_times import OTHER, TOTAL, Watch, stage_times
+from stereokit_evaluation.bench import peers
+from stereokit_evaluation.bench import table as speed_table
+from stereokit_evaluation.bench.probes import ProbeError, first_call, memory_added, stored
+from stereokit_evaluation.bench.stages import OTHER, TOTAL, Watch, stage_times
+from stereokit_evaluation.bench.table import Findings, as_json, print_tables
+from stereokit_evaluation.bench.timing import ratio, round_robin, spread
+from stereokit_evaluation.commands import bench as command
+from stereokit_evaluation.common import progress as progress_module
+from stereokit_evaluation.common.sizes import SIZES, Size, parse_sizes, parse_threads
 
 TINY = "64x48x16"
 
@@ -29,7 +32,7 @@ def bench(*words):
 
 @pytest.fixture
 def one_peer(monkeypatch):
-    monkeypatch.setattr(speed, "peers", lambda: [_peers.THREE_WAY])
+    monkeypatch.setattr(command, "peers", lambda: [peers.THREE_WAY])
 
 
 # sizes and threads
@@ -129,10 +132,10 @@ def findings():
     found = Findings(methods=["census+sgm"], sizes=[size], threads=[2], rounds=3)
     found.times[size.name, 2] = {
         "census+sgm": [0.03, 0.02, 0.05],
-        _peers.HH: [0.3, 0.3, 0.3],
-        _peers.THREE_WAY: [0.02, 0.01, 0.03],
+        peers.HH: [0.3, 0.3, 0.3],
+        peers.THREE_WAY: [0.02, 0.01, 0.03],
     }
-    found.memory = {(size.name, "census+sgm"): 50.0, (size.name, _peers.HH): 200.0, (size.name, _peers.THREE_WAY): None}
+    found.memory = {(size.name, "census+sgm"): 50.0, (size.name, peers.HH): 200.0, (size.name, peers.THREE_WAY): None}
     found.first, found.first_size = {"census+sgm": {"import_s": 0.5, "call_s": 0.25}}, size.name
     return found
 
@@ -150,11 +153,11 @@ def test_rows_hold_medians_and_ratios(findings):
 def test_memory_is_compared_with_hh(findings):
     memory = {entry["key"]: entry for entry in as_json(findings, {})["memory"]}
     assert memory["census+sgm"]["of_hh"] == 0.25
-    assert memory[_peers.THREE_WAY]["mb"] is None and memory[_peers.THREE_WAY]["of_hh"] is None
+    assert memory[peers.THREE_WAY]["mb"] is None and memory[peers.THREE_WAY]["of_hh"] is None
 
 
 def test_ratios_need_their_peer(findings):
-    del findings.times["100x10x50", 2][_peers.HH]
+    del findings.times["100x10x50", 2][peers.HH]
     assert findings.rows()[0]["x_hh"] is None
 
 
@@ -171,44 +174,44 @@ def test_tables_publish_losses(findings, capsys):
 
 
 def test_a_ratio_below_one_stands_out_for_methods_only():
-    assert _speed_report._times_faster(0.5, "method") == "[bold red]0.50[/]"
-    assert _speed_report._times_faster(0.5, "peer") == "0.50"
-    assert _speed_report._times_faster(1.5, "method") == "1.50"
-    assert _speed_report._times_faster(None, "method") == "-"
+    assert speed_table._times_faster(0.5, "method") == "[bold red]0.50[/]"
+    assert speed_table._times_faster(0.5, "peer") == "0.50"
+    assert speed_table._times_faster(1.5, "method") == "1.50"
+    assert speed_table._times_faster(None, "method") == "-"
 
 
 # contenders
 
 
 def test_labels_and_makers():
-    assert _peers.label("zncc+sgm") == "S4 zncc+sgm"
-    assert _peers.label(_peers.HH) == _peers.HH
+    assert peers.label("zncc+sgm") == "S4 zncc+sgm"
+    assert peers.label(peers.HH) == peers.HH
     with pytest.raises(UnknownNameError):
-        _peers.make("S9", 16, 1)
+        peers.make("S9", 16, 1)
 
 
 def test_opencv_takes_the_next_multiple_of_16():
-    assert [_peers.usable_levels(levels) for levels in (1, 16, 17, 256)] == [16, 16, 32, 256]
+    assert [peers.usable_levels(levels) for levels in (1, 16, 17, 256)] == [16, 16, 32, 256]
 
 
-@pytest.mark.parametrize("name", _peers.peers())
+@pytest.mark.parametrize("name", peers.peers())
 def test_every_peer_finds_a_shift(name):
     rng = np.random.default_rng(0)
     left = cv2.resize(rng.integers(0, 256, (20, 40), np.uint8), (160, 60), interpolation=cv2.INTER_CUBIC)
-    found = _peers.make(name, 16, 1)(left, np.roll(left, -6, axis=1)).astype(np.float64)
+    found = peers.make(name, 16, 1)(left, np.roll(left, -6, axis=1)).astype(np.float64)
     unit = 16 if name.startswith("OpenCV") else 1
     assert found.shape == (60, 160)
     assert np.nanmedian(found[:, 40:] / unit) == pytest.approx(6, abs=0.2)
 
 
 def test_a_peer_that_the_machine_cannot_hold_is_left_out(monkeypatch):
-    monkeypatch.setattr(speed, "_free_bytes", lambda: 1e9)
+    monkeypatch.setattr(command, "_free_bytes", lambda: 1e9)
     big = Size("big", 4000, 3000, 256)
-    assert speed._too_large(_peers.HH, big) == "needs 12.3 GB of memory, 1.0 GB are free"
-    assert speed._too_large(_peers.HH, SIZES["K"]) is None
-    assert speed._too_large("census+sgm", big) is None
-    monkeypatch.setattr(speed, "_free_bytes", lambda: None)
-    assert speed._too_large(_peers.HH, big) is None
+    assert command._too_large(peers.HH, big) == "needs 12.3 GB of memory, 1.0 GB are free"
+    assert command._too_large(peers.HH, SIZES["K"]) is None
+    assert command._too_large("census+sgm", big) is None
+    monkeypatch.setattr(command, "_free_bytes", lambda: None)
+    assert command._too_large(peers.HH, big) is None
 
 
 # stages and probes
@@ -245,7 +248,7 @@ def test_stages_of_an_unknown_core_are_other(monkeypatch):
 
 def test_probes_measure_in_new_processes(random_pair):
     with stored(*random_pair(48, 64)) as files:
-        memory = memory_added(_peers.THREE_WAY, 16, 1, files)
+        memory = memory_added(peers.THREE_WAY, 16, 1, files)
         assert memory is None or 0 <= memory < 1000
         first = first_call("census+sgm", 16, 1, files)
         assert set(first) == {"import_s", "call_s"} and min(first.values()) > 0
@@ -257,7 +260,7 @@ def test_probes_measure_in_new_processes(random_pair):
 
 
 def test_json_has_everything(tmp_path, one_peer):
-    target = tmp_path / "bench.json"
+    target = tmp_path / "command.json"
     threads = cv2.getNumThreads()
     done = bench(
         "--sizes", TINY, "--threads", "1,2", "--method", "S2", "--rounds", 1, "--stages", "--no-first-call",
@@ -265,14 +268,14 @@ def test_json_has_everything(tmp_path, one_peer):
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert cv2.getNumThreads() == threads
-    assert "S2 census+sgm" in done.stdout and _peers.THREE_WAY in done.stdout and "stages" in done.stdout
+    assert "S2 census+sgm" in done.stdout and peers.THREE_WAY in done.stdout and "stages" in done.stdout
     found = json.loads(target.read_text())
     assert list(found) == [
         "results", "memory", "first_call", "stages", "skipped", "sizes", "options", "interrupted",
         "versions", "machine",
     ]  # fmt: skip
     assert [(row["key"], row["threads"], row["runs"]) for row in found["results"]] == [
-        ("census+sgm", 1, 1), (_peers.THREE_WAY, 1, 1), ("census+sgm", 2, 1), (_peers.THREE_WAY, 2, 1),
+        ("census+sgm", 1, 1), (peers.THREE_WAY, 1, 1), ("census+sgm", 2, 1), (peers.THREE_WAY, 2, 1),
     ]  # fmt: skip
     row = found["results"][0]
     assert row["min_ms"] == row["median_ms"] == row["samples_ms"][0] > 0
@@ -304,9 +307,9 @@ def test_real_images_without_peers_to_standard_output(tmp_path, random_pair):
 def test_memory_and_first_call_are_asked_for_where_they_should(monkeypatch, one_peer):
     monkeypatch.setitem(SIZES, "K", Size("K", 80, 24, 16))
     monkeypatch.setitem(SIZES, "H", Size("H", 60, 24, 16))
-    monkeypatch.setattr(speed, "memory_added", lambda key, levels, threads, files: 2.0 if "+" in key else 4.0)
+    monkeypatch.setattr(command, "memory_added", lambda key, levels, threads, files: 2.0 if "+" in key else 4.0)
     firsts = iter([9.0, 1.0, 2.0])
-    monkeypatch.setattr(speed, "first_call", lambda *given: {"import_s": 1.0, "call_s": next(firsts)})
+    monkeypatch.setattr(command, "first_call", lambda *given: {"import_s": 1.0, "call_s": next(firsts)})
     words = "--sizes", "H,K", "--threads", "2", "--method", "S2", "--rounds", "2", "--json", "-"
     found = json.loads(bench(*words).stdout)
     assert [(entry["size"], entry["mb"]) for entry in found["memory"]] == [("K", 2.0), ("K", 4.0)]
@@ -320,8 +323,8 @@ def test_a_probe_that_fails_says_why(monkeypatch, one_peer):
     def fails(*given):
         raise ProbeError("out of luck")
 
-    monkeypatch.setattr(speed, "memory_added", fails)
-    monkeypatch.setattr(speed, "first_call", fails)
+    monkeypatch.setattr(command, "memory_added", fails)
+    monkeypatch.setattr(command, "first_call", fails)
     words = "--sizes", TINY, "--threads", "1", "--method", "S2", "--rounds", "1", "--memory", "--json", "-"
     found = json.loads(bench(*words).stdout)
     assert found["memory"] == found["first_call"] == []
@@ -330,7 +333,7 @@ def test_a_probe_that_fails_says_why(monkeypatch, one_peer):
 
 def stub(monkeypatch, calls):
     """Make the contenders do what the test says."""
-    monkeypatch.setattr(speed, "make", lambda key, levels, threads: calls[key])
+    monkeypatch.setattr(command, "make", lambda key, levels, threads: calls[key])
 
 
 def test_an_interrupt_prints_what_there_is(monkeypatch, one_peer):
@@ -340,7 +343,7 @@ def test_an_interrupt_prints_what_there_is(monkeypatch, one_peer):
         if next(runs) is not None:
             raise KeyboardInterrupt
 
-    stub(monkeypatch, {"census+sgm": lambda left, right: None, _peers.THREE_WAY: peer})
+    stub(monkeypatch, {"census+sgm": lambda left, right: None, peers.THREE_WAY: peer})
     done = bench("--sizes", f"{TINY},K", "--threads", 1, "--method", "S2", "--rounds", 5, "--json", "-")
     assert done.exit_code == 130
     found = json.loads(done.stdout)
@@ -353,11 +356,11 @@ def test_a_peer_that_fails_is_left_out_but_a_method_is_not(monkeypatch, one_peer
         raise RuntimeError("two\nlines")
 
     words = "--sizes", TINY, "--threads", 1, "--method", "S2", "--rounds", 1, "--no-first-call", "--json", "-"
-    stub(monkeypatch, {"census+sgm": lambda left, right: None, _peers.THREE_WAY: fails})
+    stub(monkeypatch, {"census+sgm": lambda left, right: None, peers.THREE_WAY: fails})
     found = json.loads(bench(*words).stdout)
     assert [row["key"] for row in found["results"]] == ["census+sgm"]
-    assert found["skipped"] == [{"size": TINY, "contender": _peers.THREE_WAY, "threads": 1, "reason": "two lines"}]
-    stub(monkeypatch, {"census+sgm": fails, _peers.THREE_WAY: fails})
+    assert found["skipped"] == [{"size": TINY, "contender": peers.THREE_WAY, "threads": 1, "reason": "two lines"}]
+    stub(monkeypatch, {"census+sgm": fails, peers.THREE_WAY: fails})
     assert isinstance(bench(*words).exception, RuntimeError)
 
 
@@ -376,7 +379,7 @@ def test_a_peer_that_fails_is_left_out_but_a_method_is_not(monkeypatch, one_peer
     ],
 )
 def test_bad_input_exits_with_2_and_one_line(words, said, monkeypatch):
-    monkeypatch.setattr(speed, "_time", lambda *given: pytest.fail("it began to work"))
+    monkeypatch.setattr(command, "_time", lambda *given: pytest.fail("it began to work"))
     done = bench(*words)
     assert done.exit_code == 2
     assert done.stderr.startswith("error: ") and said in done.stderr and done.stderr.count("\n") == 1
@@ -408,10 +411,10 @@ def test_progress_is_drawn_between_calls_only(monkeypatch):
             self.refreshed += 1
             made.append(self.refreshed)
 
-    monkeypatch.setattr(_progress, "Progress", Bar)
+    monkeypatch.setattr(progress_module, "Progress", Bar)
     now = iter([0.0, 0.5, 1.5, 1.6])
-    monkeypatch.setattr(_progress.time, "monotonic", lambda: next(now))
-    with _progress.progress(3) as (_, step):
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(now))
+    with progress_module.progress(3) as (_, step):
         for _ in range(3):
             step("one")
     assert made[0]["auto_refresh"] is False
@@ -422,6 +425,6 @@ def test_scenes_without_scikit_image_say_so(monkeypatch):
     def missing(*given):
         raise StereokitError("scikit-image is not installed")
 
-    monkeypatch.setattr(speed, "generate", missing)
+    monkeypatch.setattr(command, "generate", missing)
     done = bench("--sizes", TINY, "--method", "S2")
     assert done.exit_code == 2 and "scikit-image" in done.stderr

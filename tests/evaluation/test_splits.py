@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stereokit.errors import OptionError
-from stereokit_evaluation.frames import Frame
-from stereokit_evaluation.splits import comparison, split, split_of
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.data.splits import comparison, split, split_of
 
 
 def kitti(*numbers, truth=True):

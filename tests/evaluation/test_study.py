@@ -19,14 +19,16 @@ from typer.testing import CliRunner
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
 from stereokit.io import write_disparity
 from stereokit.registry import REFINERS
-from stereokit_evaluation import datasets, retraining, study_run
-from stereokit_evaluation.datasets import folder
-from stereokit_evaluation.frames import Frame
-from stereokit_evaluation.grid import Configuration
-from stereokit_evaluation.metrics import score
-from stereokit_evaluation.study import study
-from stereokit_evaluation.study_run import run_study
-from stereokit_evaluation.study_store import Record, Store, digest, frame_digest
+from stereokit_evaluation.commands.study import study
+from stereokit_evaluation.data import datasets
+from stereokit_evaluation.data.datasets import folder
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.scoring.kitti import score
+from stereokit_evaluation.study import run as study_run
+from stereokit_evaluation.study.configurations import Configuration
+from stereokit_evaluation.study.run import run_study
+from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
+from stereokit_evaluation.training import per_matcher
 from stereokit_refiners import Linear
 
 APP = typer.Typer()
@@ -269,7 +271,7 @@ def test_killed_twice_it_ends_with_the_same_table(tmp_path):
         import stereokit_refiners
 
         homes = [str(Path(module.__file__).parents[1]) for module in (stereokit, stereokit_refiners, study_run)]
-        program = [sys.executable, "-m", "stereokit.cli", "study", *words, "-o", str(output)]
+        program = [sys.executable, "-m", "stereokit.cli.app", "study", *words, "-o", str(output)]
         program += ["--json", str(output.with_suffix(".json"))]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(homes)}
         return subprocess.Popen(program, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -334,7 +336,7 @@ def test_training_gives_each_matcher_its_own_weights(tmp_path, monkeypatch):
         calls.append((refiner, method[0], frames, streets, settings))
         (home / "weights.safetensors").write_bytes(b"not weights")
 
-    monkeypatch.setattr(retraining, "train", train)
+    monkeypatch.setattr(per_matcher, "train", train)
     monkeypatch.setattr(datasets, "_SCENE_SIZE", (96, 48))
     datasets._scene.cache_clear()
     words = ["--dataset", "scenes", "--count", "1", "--method", "S2", "--method", "S4", "--setting", "cnn"]
@@ -355,9 +357,9 @@ def test_frames_that_are_scored_are_not_trained_on(tmp_path):
         for index in range(4):
             (tmp_path / part / f"{index:06d}_10.png").write_bytes(b"")
     every = datasets.kitti2015(tmp_path)
-    assert [f.name[:6] for f in retraining.training_frames("kitti2015", tmp_path, every[1:3])] == ["000000", "000003"]
+    assert [f.name[:6] for f in per_matcher.training_frames("kitti2015", tmp_path, every[1:3])] == ["000000", "000003"]
     with pytest.raises(OptionError, match="train must leave frames to train on"):
-        retraining.training_frames("kitti2015", tmp_path, every)
+        per_matcher.training_frames("kitti2015", tmp_path, every)
 
 
 def test_a_refiner_of_another_package_joins(pairs, tmp_path, monkeypatch):

@@ -17,11 +17,11 @@ import pytest
 from typer.testing import CliRunner
 
 import stereokit
-from stereokit.cli import app
+from stereokit.cli.app import app
 from stereokit.errors import InputError
-from stereokit_evaluation import training_pairs
-from stereokit_evaluation.frames import Frame
-from stereokit_evaluation.training_pairs import FIRST_SEED, pair_of, scene_pair
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.training import pairs as training_pairs
+from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of, scene_pair
 
 FRAMES = 5
 SHIFT = [6, 8, 10, 12, 14]
@@ -213,8 +213,8 @@ def test_the_papers_preset_and_settings_over_it(root, tmp_path, trainable):
 @pytest.fixture
 def recorded(monkeypatch, trainable):
     """Replace the training by one that keeps the frames it is given, which their disparity tells."""
-    from stereokit_refiners import training
-    from stereokit_refiners.layers import shapes
+    from stereokit_refiners.networks.layers import shapes
+    from stereokit_refiners.training import loop
 
     calls = []
 
@@ -234,9 +234,9 @@ def recorded(monkeypatch, trainable):
         )
         checkpoint.parent.mkdir(exist_ok=True)
         arrays = {name: np.zeros(shape, np.float32) for name, shape in shapes(network).items()}
-        return arrays, training.History([(settings.steps, 1.0, None)])
+        return arrays, loop.History([(settings.steps, 1.0, None)])
 
-    monkeypatch.setattr(training, "fit", fit)
+    monkeypatch.setattr(loop, "fit", fit)
     return calls
 
 
@@ -271,7 +271,7 @@ def test_validation_frames_are_never_trained_on(root, tmp_path, recorded):
 
 
 def test_samples_stay_on_the_disk_until_they_are_drawn(root, tmp_path, recorded, monkeypatch):
-    from stereokit_refiners.samples import Shelf
+    from stereokit_refiners.training.samples import Shelf
 
     monkeypatch.setattr(training_pairs, "generate", small_scene)
     trained(root, tmp_path / "out", "--frames", "0-1", "--validation", "2", "--streets", "1")
@@ -345,10 +345,10 @@ def test_streets_keep_their_share_beside_extra_frames_alone(root, tmp_path, reco
 
 def test_a_training_that_stops_early_writes_its_folder(root, tmp_path, trainable, monkeypatch):
     """Before the first checkpoint by time, and not at the last step."""
-    from stereokit_refiners import training
+    from stereokit_refiners.training import loop
 
     scores = iter([1.0, 2.0] * 4)
-    monkeypatch.setattr(training, "_score", lambda *given: next(scores))
+    monkeypatch.setattr(loop, "_score", lambda *given: next(scores))
     report = tmp_path / "r.json"
     trained(root, tmp_path / "out", "--folds", "0/1", "--set", "patience=1", "--set", "steps=50", "--json", report,
             settings=SETTINGS[2:])  # fmt: skip
@@ -382,10 +382,10 @@ def test_a_folder_of_other_settings_is_refused(root, tmp_path, trainable):
 
 KILLED = """
 import functools, os, signal, sys
-from stereokit_refiners import training
+from stereokit_refiners.training import loop
 
-training.fit = functools.partial(training.fit, save_every_s=-1)  # a checkpoint after each step
-kill, count, real = os.environ["KILL"], 0, training.write_bytes
+loop.fit = functools.partial(loop.fit, save_every_s=-1)  # a checkpoint after each step
+kill, count, real = os.environ["KILL"], 0, loop.write_bytes
 
 def write(path, data):
     global count
@@ -398,9 +398,9 @@ def write(path, data):
     if kill == f"after {count}":
         os.kill(os.getpid(), signal.SIGKILL)
 
-training.write_bytes = write
+loop.write_bytes = write
 sys.argv[0] = "stereokit"
-from stereokit.cli import main
+from stereokit.cli.app import main
 main()
 """
 

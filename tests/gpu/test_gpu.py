@@ -15,8 +15,8 @@ from stereokit import Matcher
 from stereokit.aggregation.sgm import Sgm
 from stereokit.costs import Census, Zncc
 from stereokit.costs.rows import Levels
+from stereokit.cuda.driver import describe, has_device
 from stereokit.errors import DeviceError
-from stereokit.kernels.device import describe, has_device
 
 pytestmark = [
     pytest.mark.gpu,
@@ -28,7 +28,7 @@ SHAPE = (375, 1242)
 
 @pytest.fixture
 def queue():
-    from stereokit.kernels.queue_cuda import DeviceQueue
+    from stereokit.cuda.stream import DeviceQueue
 
     return DeviceQueue()
 
@@ -134,7 +134,7 @@ def test_too_large_a_volume_names_what_is_needed_and_free():
 def test_the_bench_times_host_and_device_images():
     from typer.testing import CliRunner
 
-    from stereokit.cli import app
+    from stereokit.cli.app import app
 
     words = "bench --device cuda --sizes 160x60x32 --method S4 --rounds 2 --no-peers --json -"
     done = CliRunner().invoke(app, words.split())

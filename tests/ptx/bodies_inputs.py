@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereokit import inputs, inputs_cuda
-from stereokit.kernels.cuda import blocks_for
+from stereokit.cuda.kernel import blocks_for
+from stereokit.images import gray, prepare_cuda
 
 SHAPES = [(1, 1), (5, 33), (8, 7)]
 
@@ -29,11 +29,11 @@ def check_grey(queue, dtype=np.uint8):
     assert ties.shape[1] > 250
     for colour in [*(_pair((*shape, 3), dtype) for shape in SHAPES), np.stack([ties, ties[:, ::-1]])]:
         shape = height, width = colour.shape[1:3]
-        want = inputs.gray_pair(*colour)
+        want = gray.gray_pair(*colour)
         out = queue.array("pair", 2 * height * width, dtype)
         for place, image in enumerate(colour):
             flat = queue.upload(f"in{place}", image)
-            inputs_cuda.take(queue, flat, np.dtype(dtype), out, place, 3, False, shape)
+            prepare_cuda.take(queue, flat, np.dtype(dtype), out, place, 3, False, shape)
         np.testing.assert_array_equal(queue.fetch(out).reshape(2, *shape), [want.left, want.right])
 
 
@@ -43,7 +43,7 @@ def check_mirrored(queue, dtype=np.uint8):
         out = queue.array("pair", 2 * image.size, dtype)
         for place, mirrored in enumerate((False, True)):
             flat = queue.upload("in", image)
-            inputs_cuda.take(queue, flat, np.dtype(dtype), out, place, 1, mirrored, shape)
+            prepare_cuda.take(queue, flat, np.dtype(dtype), out, place, 1, mirrored, shape)
         np.testing.assert_array_equal(queue.fetch(out).reshape(2, *shape), [image, image[:, ::-1]])
 
 
@@ -51,8 +51,8 @@ def check_flipped(queue):
     for height, width in SHAPES:
         image = np.random.default_rng(0).normal(size=(height, width)).astype(np.float32)
         out = queue.array("out", image.size, np.float32)
-        blocks = blocks_for(image.size, inputs_cuda.flip.block)
-        queue.launch(inputs_cuda.flip, blocks, queue.upload("in", image), out, height, width)
+        blocks = blocks_for(image.size, prepare_cuda.flip.block)
+        queue.launch(prepare_cuda.flip, blocks, queue.upload("in", image), out, height, width)
         np.testing.assert_array_equal(queue.fetch(out).reshape(image.shape), image[:, ::-1])
 
 
@@ -60,12 +60,12 @@ def check_halved(queue, dtype=np.uint8):
     for shape in SHAPES:
         pair = _pair(shape, dtype)
         bad = np.random.default_rng(1).random((2, *shape)) < 0.2
-        want = inputs.half_size(inputs.GrayPair(*pair, *bad, pair[0].astype(np.uint8)))
+        want = gray.half_size(gray.GrayPair(*pair, *bad, pair[0].astype(np.uint8)))
         half = queue.upload("in", pair)
-        out = inputs_cuda.halve(queue, "half", half, np.dtype(dtype), 2, shape, False)
+        out = prepare_cuda.halve(queue, "half", half, np.dtype(dtype), 2, shape, False)
         np.testing.assert_array_equal(queue.fetch(out).reshape(2, *want.left.shape), [want.left, want.right])
         masks = queue.upload("bad", bad.view(np.uint8))
-        out = inputs_cuda.halve(queue, "half.bad", masks, np.dtype(np.uint8), 2, shape, True)
+        out = prepare_cuda.halve(queue, "half.bad", masks, np.dtype(np.uint8), 2, shape, True)
         found = queue.fetch(out).reshape(2, *want.left.shape)
         np.testing.assert_array_equal(found != 0, [want.left_bad, want.right_bad])
 
@@ -73,14 +73,14 @@ def check_halved(queue, dtype=np.uint8):
 def check_blurred(queue, dtype=np.uint8, sigmas=(0.3, 0.7, 2.0)):
     for shape, sigma in zip(SHAPES, sigmas, strict=True):
         pair = _pair(shape, dtype)
-        want = inputs.smooth(inputs.GrayPair(*pair, None, None, pair[0].astype(np.uint8)), sigma)
-        out = inputs_cuda.smooth(queue, queue.upload("in", pair), np.dtype(dtype), sigma, shape)
+        want = gray.smooth(gray.GrayPair(*pair, None, None, pair[0].astype(np.uint8)), sigma)
+        out = prepare_cuda.smooth(queue, queue.upload("in", pair), np.dtype(dtype), sigma, shape)
         np.testing.assert_array_equal(queue.fetch(out).reshape(2, *shape), [want.left, want.right])
 
 
 def check_ranges(queue, dtype=np.uint8):
     for shape in ((1, 1), (19, 33), (130, 70)):
         pair = _pair(shape, dtype)
-        out = inputs_cuda.ranges(queue, queue.upload("in", pair), np.dtype(dtype), pair[0].size)
+        out = prepare_cuda.ranges(queue, queue.upload("in", pair), np.dtype(dtype), pair[0].size)
         want = [pair[0].min(), pair[0].max(), pair[1].min(), pair[1].max()]
         np.testing.assert_array_equal(queue.fetch(out), want)

@@ -3,7 +3,7 @@
 ``python -m ptx.budgets`` in ``tests/`` prints the table; with ``--write`` it replaces ``budgets.json``, which the tests
 hold the kernels to. PTX for sm_72 runs on every later card, so each kernel is compiled once and assembled four times.
 The hot loop is the longest one, as it was unrolled, or all of a kernel without loops; that of sm_72 is the code for
-sm_75, as `stereokit_evaluation._gpu_code` tells.
+sm_75, as `stereokit_evaluation.gpu_model.sass` tells.
 """
 
 from __future__ import annotations
@@ -14,8 +14,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from stereokit_evaluation._gpu_code import ARCHITECTURES, DISASSEMBLED, Code, Resources, code_of, tool, warps_that_fit
-from stereokit_evaluation._gpu_code import resources as taken_by
+from stereokit_evaluation.gpu_model.sass import (
+    ARCHITECTURES,
+    DISASSEMBLED,
+    Code,
+    Resources,
+    code_of,
+    tool,
+    warps_that_fit,
+)
+from stereokit_evaluation.gpu_model.sass import resources as taken_by
 
 __all__ = ["ARCHITECTURES", "TABLE", "assembled", "has_tools", "kernels", "ptx", "resources"]
 
@@ -29,8 +37,8 @@ def has_tools() -> bool:
 
 def kernels() -> dict[str, Any]:
     """Return every kernel of the project by name."""
-    import stereokit.pipeline_cuda  # noqa: F401 (its imports file the kernels)
-    from stereokit.kernels.cuda import KERNELS
+    import stereokit.cuda.pipeline  # noqa: F401 (its imports file the kernels)
+    from stereokit.cuda.kernel import KERNELS
 
     return KERNELS
 

@@ -1,4 +1,4 @@
-"""A queue of launches that runs on the CPU: `stereokit.kernels.cuda.Queue` for tests."""
+"""A queue of launches that runs on the CPU: `stereokit.cuda.kernel.Queue` for tests."""
 
 from __future__ import annotations
 

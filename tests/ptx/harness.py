@@ -100,7 +100,7 @@ def run(
 
     Parameters
     ----------
-    kernel : stereokit.kernels.cuda.Kernel or str
+    kernel : stereokit.cuda.kernel.Kernel or str
         The kernel, or PTX text whose parameters are plain pointers and numbers.
     blocks : int
         Blocks of the grid.

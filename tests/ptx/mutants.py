@@ -33,29 +33,31 @@ SIZES: dict[str, dict[str, Any]] = {
 
 MUTANTS = [
     # ------------------------------------------------------------------ images
-    Mutant("grey rounds halves down", "inputs_cuda", "u32(16384)", "u32(16383)", _ROUNDING, "inputs.check_grey"),
     Mutant(
-        "odd widths average a pixel of the next row", "inputs_cuda",
+        "grey rounds halves down", "images.prepare_cuda", "u32(16384)", "u32(16383)", _ROUNDING, "inputs.check_grey"
+    ),
+    Mutant(
+        "odd widths average a pixel of the next row", "images.prepare_cuda",
         "x1 = min(u32(x0 + u32(1)), u32(u32(width) - u32(1)))", "x1 = u32(x0 + u32(1))",
         _BORDER, "inputs.check_halved",
     ),
     Mutant(
-        "weighted sums of columns in 32 bits", "inputs_cuda",
+        "weighted sums of columns in 32 bits", "images.prepare_cuda",
         "u64(weights[u32(k)]) * u64(rows[u32(u32(base + u32(other)) * u32(width) + x)])",
         "u64(u32(weights[u32(k)] * rows[u32(u32(base + u32(other)) * u32(width) + x)]))",
         _OVERFLOW, "inputs.check_blurred",
     ),
     Mutant(
-        "ranges of warps are joined without a barrier", "inputs_cuda",
+        "ranges of warps are joined without a barrier", "images.prepare_cuda",
         "        cuda.syncthreads()\n", "", _RACE, "inputs.check_ranges",
     ),
     Mutant(
-        "the barrier of the ranges within a branch", "inputs_cuda",
+        "the barrier of the ranges within a branch", "images.prepare_cuda",
         "= high\n        cuda.syncthreads()\n", "= high\n            cuda.syncthreads()\n",
         _BARRIER, "inputs.check_ranges",
     ),
     Mutant(
-        "every other warp leaves no range in shared memory", "inputs_cuda",
+        "every other warp leaves no range in shared memory", "images.prepare_cuda",
         "if thread & u32(31) == 0:\n            lows", "if thread & u32(63) == 0:\n            lows",
         _UNWRITTEN, "inputs.check_ranges",
     ),

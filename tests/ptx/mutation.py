@@ -23,7 +23,7 @@ from typing import Any
 from ptx import harness
 from ptx.emulated import EmulatedQueue
 from ptx.errors import KernelError, UnknownInstruction
-from stereokit.kernels.cuda import KERNELS
+from stereokit.cuda.kernel import KERNELS
 
 __all__ = ["SCHEDULES", "Mutant", "StaleMutant", "Uncompiled", "how_caught", "planted"]
 

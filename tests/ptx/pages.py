@@ -13,9 +13,9 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from stereokit.cli import app
+from stereokit.cli.app import app
 from stereokit.defaults import METHODS
-from stereokit_evaluation.gpu_machines import MACHINES
+from stereokit_evaluation.gpu_model.machines import MACHINES
 
 PAGE = Path(__file__).parents[2] / "docs" / "gpu.md"
 _NAMES = [machine.name for machine in MACHINES]

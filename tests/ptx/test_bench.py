@@ -10,9 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from ptx.emulated import EmulatedQueue
-from stereokit import matching, pipeline_cuda
-from stereokit.cli import app
-from stereokit_evaluation import _gpu_times, _peers, speed
+from stereokit import matching
+from stereokit.cli.app import app
+from stereokit.cuda import pipeline as cuda_pipeline
+from stereokit_evaluation.bench import gpu as gpu_times
+from stereokit_evaluation.bench import peers
+from stereokit_evaluation.commands import bench as command
 
 SIZE = "40x10x16"
 
@@ -28,19 +31,19 @@ def waits(monkeypatch) -> list[int]:
         return queues[-1]
 
     def from_device(name: str, image: Any) -> Any:
-        return pipeline_cuda._Image(image.ravel(), image.dtype, 1, image.shape)
+        return cuda_pipeline._Image(image.ravel(), image.dtype, 1, image.shape)
 
-    monkeypatch.setattr(pipeline_cuda, "new_queue", new_queue)
-    monkeypatch.setattr(pipeline_cuda, "_from_device", from_device)
-    monkeypatch.setattr(pipeline_cuda, "_reshaped", lambda held, shape: held.values.reshape(shape))
-    monkeypatch.setattr(pipeline_cuda.cuda, "default_stream", lambda: 0)
-    monkeypatch.setattr(pipeline_cuda, "stream_of", lambda stream: stream)
+    monkeypatch.setattr(cuda_pipeline, "new_queue", new_queue)
+    monkeypatch.setattr(cuda_pipeline, "_from_device", from_device)
+    monkeypatch.setattr(cuda_pipeline, "_reshaped", lambda held, shape: held.values.reshape(shape))
+    monkeypatch.setattr(cuda_pipeline.cuda, "default_stream", lambda: 0)
+    monkeypatch.setattr(cuda_pipeline, "stream_of", lambda stream: stream)
     monkeypatch.setattr(matching, "require_device", lambda: None)
-    monkeypatch.setattr(_gpu_times, "require_device", lambda: None)
-    monkeypatch.setattr(_gpu_times, "_resident", lambda image: image.copy())
-    monkeypatch.setattr(_gpu_times, "_wait", lambda: found.append(sum(len(queue.launches) for queue in queues)))
-    monkeypatch.setattr(speed, "peers", lambda: [_peers.THREE_WAY])
-    monkeypatch.setattr(speed, "describe", lambda: "an interpreter")
+    monkeypatch.setattr(gpu_times, "require_device", lambda: None)
+    monkeypatch.setattr(gpu_times, "_resident", lambda image: image.copy())
+    monkeypatch.setattr(gpu_times, "_wait", lambda: found.append(sum(len(queue.launches) for queue in queues)))
+    monkeypatch.setattr(command, "peers", lambda: [peers.THREE_WAY])
+    monkeypatch.setattr(command, "describe", lambda: "an interpreter")
     return found
 
 
@@ -53,7 +56,7 @@ def test_host_and_device_images_and_a_peer(waits):
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     rows = {row["contender"]: row for row in found["results"]}
-    assert list(rows) == ["S2 census+sgm, GPU, host images", "S2 census+sgm, GPU, device images", _peers.THREE_WAY]
+    assert list(rows) == ["S2 census+sgm, GPU, host images", "S2 census+sgm, GPU, device images", peers.THREE_WAY]
     assert [row["kind"] for row in rows.values()] == ["method", "method", "peer"]
     assert all(row["runs"] == 2 and row["median_ms"] > 0 and row["x_3way"] > 0 for row in rows.values())
     assert found["options"]["device"] == "an interpreter" and found["memory"] == found["first_call"] == []
@@ -73,11 +76,11 @@ def test_calls_give_the_map_of_the_cpu(waits):
     left = np.random.default_rng(0).integers(0, 256, (8, 40), dtype=np.uint8)
     right = np.roll(left, -3, axis=1)
     want = matching.Matcher("S2", max_disparity=16, device="cpu")(left, right).disparity
-    ours = _gpu_times.contenders(["census+sgm"], 1)
-    build = _gpu_times.maker(ours)
+    ours = gpu_times.contenders(["census+sgm"], 1)
+    build = gpu_times.maker(ours)
     for name in ours:
         call = build(name, 16, 1)
         for _ in range(2):
             np.testing.assert_array_equal(np.asarray(call(left, right)), want)
-    peer = build(_peers.THREE_WAY, 16, 1)
+    peer = build(peers.THREE_WAY, 16, 1)
     assert peer(left, right).shape == left.shape

@@ -11,7 +11,8 @@ pytest.importorskip("numba_cuda")
 
 from ptx.emulated import EmulatedQueue
 from ptx.harness import Buffer
-from stereokit import Matcher, matching, pipeline_cuda
+from stereokit import Matcher, matching
+from stereokit.cuda import pipeline as cuda_pipeline
 from stereokit.errors import DeviceError, InputError
 from stereokit.result import Disparity
 from stereokit_refiners.linear import Linear
@@ -38,7 +39,7 @@ def queues(monkeypatch):
         made.append(_Queue())
         return made[-1]
 
-    monkeypatch.setattr(pipeline_cuda, "new_queue", new_queue)
+    monkeypatch.setattr(cuda_pipeline, "new_queue", new_queue)
     monkeypatch.setattr(matching, "require_device", lambda: None)
     return made
 
@@ -139,7 +140,7 @@ def host_as_device(queues, monkeypatch):
 
     def from_device(name: str, image: Any) -> Any:
         channels = 1 if image.ndim == 2 else 3
-        return pipeline_cuda._Image(np.ascontiguousarray(image).ravel(), image.dtype, channels, image.shape[:2])
+        return cuda_pipeline._Image(np.ascontiguousarray(image).ravel(), image.dtype, channels, image.shape[:2])
 
     def flat(held: Any) -> Buffer:
         values = held.values if isinstance(held, Buffer) else np.asarray(held).ravel()
@@ -147,10 +148,10 @@ def host_as_device(queues, monkeypatch):
         out.values[:], out.known[:] = values, 1
         return out
 
-    monkeypatch.setattr(pipeline_cuda, "_from_device", from_device)
-    monkeypatch.setattr(pipeline_cuda, "stream_of", lambda stream: stream)
-    monkeypatch.setattr(pipeline_cuda, "_reshaped", lambda held, shape: held.values.reshape(shape))
-    monkeypatch.setattr(pipeline_cuda, "_flat", flat)
+    monkeypatch.setattr(cuda_pipeline, "_from_device", from_device)
+    monkeypatch.setattr(cuda_pipeline, "stream_of", lambda stream: stream)
+    monkeypatch.setattr(cuda_pipeline, "_reshaped", lambda held, shape: held.values.reshape(shape))
+    monkeypatch.setattr(cuda_pipeline, "_flat", flat)
 
 
 def test_images_of_the_device(host_as_device):

@@ -8,7 +8,7 @@ import pytest
 
 from ptx import bodies_inputs as bodies
 from ptx.emulated import EmulatedQueue
-from stereokit.inputs_cuda import gaussian_weights
+from stereokit.images.prepare_cuda import gaussian_weights
 
 SEEDS = [None, 1, 2, 3]
 TYPES = [np.uint8, np.uint16]

@@ -10,10 +10,10 @@ import pytest
 from ptx.emulated import EmulatedQueue
 from ptx.harness import Report, translation_of
 from stereokit import Matcher
+from stereokit.cuda.pipeline import CudaPipeline
 from stereokit.defaults import METHODS
-from stereokit.pipeline_cuda import CudaPipeline
-from stereokit_evaluation._gpu_code import Code, outer_loops
-from stereokit_evaluation.gpu_model import named, record, work_of
+from stereokit_evaluation.gpu_model.model import named, record, work_of
+from stereokit_evaluation.gpu_model.sass import Code, outer_loops
 
 MATCHES = {  # method, scale, height, width, levels; two sizes of what takes the time
     "S4": (1, 24, 96, 32),

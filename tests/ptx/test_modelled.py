@@ -12,9 +12,9 @@ import pytest
 
 from ptx import budgets
 from ptx.pages import PAGE
-from stereokit_evaluation import _gpu_report as report
-from stereokit_evaluation._sizes import SIZES
-from stereokit_evaluation.gpu_machines import MACHINES, libsgm_bytes
+from stereokit_evaluation.common.sizes import SIZES
+from stereokit_evaluation.gpu_model import table as report
+from stereokit_evaluation.gpu_model.machines import MACHINES, libsgm_bytes
 
 TEXT = PAGE.read_text(encoding="utf-8")
 

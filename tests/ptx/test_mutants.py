@@ -13,7 +13,7 @@ from ptx import bodies_sgm, harness, mutants
 from ptx.emulated import EmulatedQueue
 from ptx.errors import UnknownInstruction
 from ptx.mutation import Mutant, StaleMutant, Uncompiled, how_caught, planted
-from stereokit.kernels.cuda import KERNELS
+from stereokit.cuda.kernel import KERNELS
 
 DOUBT = Mutant("", "selection.wta_cuda", "confidence[at] = f32(0)", "confidence[at] = f32(1)", "", "sgm.check_doubt")
 

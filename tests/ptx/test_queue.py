@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
+from stereokit.cuda import stream
 from stereokit.errors import DeviceError
-from stereokit.kernels import queue_cuda
 
 
 class _Array:
@@ -62,12 +62,12 @@ class _Cuda:
 @pytest.fixture
 def fake(monkeypatch):
     held = _Cuda()
-    monkeypatch.setattr(queue_cuda, "cuda", held)
+    monkeypatch.setattr(stream, "cuda", held)
     return held
 
 
 def test_arrays_stay_until_size_or_type_change(fake):
-    queue = queue_cuda.DeviceQueue()
+    queue = stream.DeviceQueue()
     first = queue.array("a", 10, np.uint8)
     assert queue.array("a", 10, np.uint8) is first
     assert queue.array("b", 10, np.uint8) is not first
@@ -79,7 +79,7 @@ def test_arrays_stay_until_size_or_type_change(fake):
 def test_the_end_of_memory_names_what_is_needed_and_free(fake):
     fake.room = 100
     with pytest.raises(DeviceError) as caught:
-        queue_cuda.DeviceQueue().array("costs", 51, np.uint16)
+        stream.DeviceQueue().array("costs", 51, np.uint16)
     assert str(caught.value) == (
         "out of device memory: 'costs' needs 102 bytes, 100 of 1000000 are free; "
         "try a smaller image, fewer levels or fewer paths"
@@ -92,11 +92,11 @@ def test_other_failures_of_the_driver_are_not_hidden(fake, monkeypatch):
 
     monkeypatch.setattr(fake, "device_array", fail, raising=False)
     with pytest.raises(RuntimeError, match="LAUNCH_FAILED"):
-        queue_cuda.DeviceQueue().array("costs", 5, np.uint16)
+        stream.DeviceQueue().array("costs", 5, np.uint16)
 
 
 def test_an_upload_waits_only_for_the_last_one_of_its_name(fake):
-    queue = queue_cuda.DeviceQueue()
+    queue = stream.DeviceQueue()
     values = np.arange(6, dtype=np.int32).reshape(2, 3)
     queue.upload("a", values)
     assert "wait for copy" not in fake.log
@@ -106,7 +106,7 @@ def test_an_upload_waits_only_for_the_last_one_of_its_name(fake):
 
 
 def test_tables_are_uploaded_once_for_a_key(fake):
-    queue = queue_cuda.DeviceQueue()
+    queue = stream.DeviceQueue()
     made: list[int] = []
 
     def make(value: int) -> Any:
@@ -120,7 +120,7 @@ def test_tables_are_uploaded_once_for_a_key(fake):
 
 
 def test_fetched_and_copied_arrays_are_the_callers(fake):
-    queue = queue_cuda.DeviceQueue()
+    queue = stream.DeviceQueue()
     held = queue.upload("a", np.arange(5, dtype=np.float32))
     fetched, copied = queue.fetch(held), queue.copy(held)
     assert "wait for stream" in fake.log
@@ -140,7 +140,7 @@ def test_launches_are_configured_once_and_without_warnings(fake):
             warnings.warn("Grid size 2 will likely result in GPU under-utilization", UserWarning, stacklevel=1)
             return lambda *arguments: ran.append(arguments)
 
-    queue = queue_cuda.DeviceQueue()
+    queue = stream.DeviceQueue()
     what: Any = SimpleNamespace(name="k", block=128, compiled=Compiled())
     for value in (1, 2):
         queue.launch(what, 2, value)
@@ -150,9 +150,9 @@ def test_launches_are_configured_once_and_without_warnings(fake):
 
 
 def test_streams_of_others_are_known_by_their_address(monkeypatch):
-    monkeypatch.setattr(queue_cuda, "cuda", SimpleNamespace(external_stream=lambda address: ("external", address)))
+    monkeypatch.setattr(stream, "cuda", SimpleNamespace(external_stream=lambda address: ("external", address)))
     own = object()
-    assert queue_cuda.stream_of(SimpleNamespace(cuda_stream=17)) == ("external", 17)  # PyTorch
-    assert queue_cuda.stream_of(SimpleNamespace(ptr=18)) == ("external", 18)  # CuPy
-    assert queue_cuda.stream_of(19) == ("external", 19)
-    assert queue_cuda.stream_of(own) is own
+    assert stream.stream_of(SimpleNamespace(cuda_stream=17)) == ("external", 17)  # PyTorch
+    assert stream.stream_of(SimpleNamespace(ptr=18)) == ("external", 18)  # CuPy
+    assert stream.stream_of(19) == ("external", 19)
+    assert stream.stream_of(own) is own

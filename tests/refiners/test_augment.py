@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stereokit_refiners import augment
-from stereokit_refiners.augment import Views, mirrored, moved_objects, photographed, rescaled
+from stereokit_refiners.training import augment
+from stereokit_refiners.training.augment import Views, mirrored, moved_objects, photographed, rescaled
 
 NAN = np.nan
 SIZE = (100, 280)

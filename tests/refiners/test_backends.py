@@ -10,7 +10,7 @@ import oracles
 import pytest
 from refining import NAMES, coarse_of, encoded_of, image_of, needs_backend, random_arrays, random_content
 
-from stereokit_refiners.network import LearnedRefiner
+from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import NETWORKS
 
 TOLERANCE_PX = 2e-3
@@ -29,7 +29,7 @@ def refined(content, backend, precision="fp32", threads=1, size=SIZE):
 def calibrated(name, seed=0):
     """Return the ranges of the activations of random weights, as training finds them."""
     torch = pytest.importorskip("torch")
-    from stereokit_refiners._torch import Module, calibrate
+    from stereokit_refiners.runtimes.torch import Module, calibrate
 
     module = Module(NETWORKS[name])
     module.load(random_arrays(name, seed))
@@ -56,12 +56,12 @@ def test_heads_of_the_papers_networks_against_loops(name, backend):
     arrays, inputs = random_arrays(name, 1, last=1.0), encoded_of(name, 8, 12)
     network = NETWORKS[name]
     if backend == "openvino":
-        from stereokit_refiners._openvino import compiled
+        from stereokit_refiners.runtimes.openvino import compiled
 
         run = compiled(network, arrays, 8, 12, 1, "fp32", None)
     else:
         pytest.importorskip("onnx")
-        from stereokit_refiners._onnx import session
+        from stereokit_refiners.runtimes.onnx import session
 
         run = session(network, arrays, 1)
     head = run(inputs)
@@ -116,7 +116,7 @@ def test_int8_does_not_drown_small_channels():
     scaled = dataclasses.replace(content, arrays=arrays)
     np.testing.assert_allclose(refined(scaled, "openvino"), refined(content, "openvino"), atol=TOLERANCE_PX)
     torch = pytest.importorskip("torch")
-    from stereokit_refiners._torch import Module, calibrate
+    from stereokit_refiners.runtimes.torch import Module, calibrate
 
     errors = []
     for one in (content, scaled):
@@ -145,7 +145,7 @@ def test_calibration_covers_every_activation_but_the_linear_ones(name):
 
 def test_calibration_is_the_largest_but_for_a_thousandth_over_all_batches():
     torch = pytest.importorskip("torch")
-    from stereokit_refiners._torch import Module, calibrate
+    from stereokit_refiners.runtimes.torch import Module, calibrate
 
     network = NETWORKS["cnn"]
     module = Module(network)

@@ -10,9 +10,9 @@ from refining import LEARNED, NAMES, coarse_of, half_of, image_of, needs_backend
 
 import stereokit
 from stereokit.errors import FileError
+from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.linear import Linear
-from stereokit_refiners.network import LearnedRefiner
-from stereokit_refiners.pyramid import CANDIDATES, OFFSETS
+from stereokit_refiners.networks.pyramid import CANDIDATES, OFFSETS
 from stereokit_refiners.weights import NETWORKS, shipped
 
 pytestmark = needs_backend
@@ -61,7 +61,7 @@ def test_a_phase_that_is_sure_of_a_candidate_copies_it(backend, choice, size):
 @pytest.mark.parametrize("choice", CHOICES)
 def test_tensors_copy_the_same_candidate(choice, size):
     pytest.importorskip("torch")
-    from stereokit_refiners.tensors import TensorRefiner
+    from stereokit_refiners.runtimes.tensors import TensorRefiner
 
     coarse = coarse_of(size, 1)
     given = coarse.disparity, coarse.confidence, image_of(size, 1), coarse.candidates
@@ -73,7 +73,7 @@ def test_tensors_copy_the_same_candidate(choice, size):
 def test_exported_graphs_copy_the_same_candidate(choice):
     onnxruntime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
-    from stereokit_refiners.export import onnx_model
+    from stereokit_refiners.commands.export import onnx_model
 
     size = (16, 32)
     coarse, left = coarse_of(size, 1), image_of(size, 1).astype(np.float32)

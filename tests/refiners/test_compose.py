@@ -6,8 +6,8 @@ import numpy as np
 import oracles
 import pytest
 
-from stereokit_refiners._compose import compose
-from stereokit_refiners.pyramid import CANDIDATES, OFFSETS
+from stereokit_refiners.networks.pyramid import CANDIDATES, OFFSETS
+from stereokit_refiners.runtimes.compose import compose
 
 RULES = [("stereovae", "residual"), ("cnn", "residual"), ("stereovae", "literal"), ("stereokit", "residual")]
 SIZES = [(8, 12), (7, 11), (1, 1), (2, 2), (1, 9), (9, 1), (2, 7), (13, 6)]
@@ -72,11 +72,11 @@ def test_threads_do_not_change_a_bit(name, form, size):
 @pytest.mark.parametrize(("name", "form"), RULES)
 def test_the_torch_twin_agrees(name, form, size):
     torch = pytest.importorskip("torch")
-    from stereokit_refiners import _torch
+    from stereokit_refiners.runtimes import torch as torch_runtime
 
     head, coarse, two = given(name, size, 3)
     tensor = torch.from_numpy(head.transpose(2, 0, 1).copy())[None]
-    twin = _torch.compose(name, form, tensor, torch.from_numpy(coarse)[None, None], torch.from_numpy(two)[None])
+    twin = torch_runtime.compose(name, form, tensor, torch.from_numpy(coarse)[None, None], torch.from_numpy(two)[None])
     assert twin.shape == (1, 1, *size)
     expected = compose(name, form, head, coarse, *size, candidates=two)
     np.testing.assert_allclose(twin[0, 0].numpy(), expected, rtol=1e-5, atol=1e-4)

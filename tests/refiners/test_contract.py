@@ -1,4 +1,4 @@
-"""The contract of `stereokit_refiners.refiner`, for every learned refiner: with random weights, and as shipped."""
+"""The contract of `stereokit_refiners.contract`, for every learned refiner: with random weights, and as shipped."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from refining import (
 import stereokit
 from stereokit import Disparity
 from stereokit.errors import FileError, OptionError, StereokitError
-from stereokit_refiners.network import LearnedRefiner
+from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import NETWORKS, shipped
 
 pytestmark = needs_backend

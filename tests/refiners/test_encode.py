@@ -8,7 +8,7 @@ import pytest
 from refining import one_line
 
 from stereokit.errors import OptionError
-from stereokit_refiners.encode import FORMS, check_form, encode, half_image
+from stereokit_refiners.runtimes.encode import FORMS, check_form, encode, half_image
 
 ALL = ("disparity", "image", "confidence", "candidates", "phases")
 

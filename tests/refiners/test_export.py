@@ -11,10 +11,10 @@ from refining import NAMES, coarse_of, flat_ranges, half_of, image_of, random_co
 from typer.testing import CliRunner
 
 from stereokit import Disparity
-from stereokit.cli import app
+from stereokit.cli.app import app
 from stereokit.errors import FileError
-from stereokit_refiners import export as module
-from stereokit_refiners.network import LearnedRefiner
+from stereokit_refiners.commands import export as module
+from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import NETWORKS, shipped
 
 for _package in ("safetensors", "onnx", "onnxruntime"):

@@ -13,7 +13,7 @@ from stereokit.errors import OptionError
 
 torch = pytest.importorskip("torch")
 
-from stereokit_refiners.losses import LOSSES, distance, divergence  # noqa: E402
+from stereokit_refiners.training.losses import LOSSES, distance, divergence  # noqa: E402
 
 
 def at(kind, error, truth=40.0):

@@ -7,9 +7,9 @@ import oracles
 import pytest
 from refining import NAMES, encoded_of, random_arrays
 
-from stereokit_refiners.layers import Layer, cost, shapes, sub_pixel_kernel, sub_pixel_taps
-from stereokit_refiners.pyramid import Pyramid
-from stereokit_refiners.stereovae import NonVae, StereoVae
+from stereokit_refiners.networks.layers import Layer, cost, shapes, sub_pixel_kernel, sub_pixel_taps
+from stereokit_refiners.networks.pyramid import Pyramid
+from stereokit_refiners.networks.stereovae import NonVae, StereoVae
 from stereokit_refiners.weights import NETWORKS
 
 TABLE_1 = [
@@ -183,7 +183,7 @@ def pyramid_by_loops(arrays, disparity, confidence, phases, candidates):
 
 def module_of(name, arrays):
     pytest.importorskip("torch")
-    from stereokit_refiners._torch import Module
+    from stereokit_refiners.runtimes.torch import Module
 
     module = Module(NETWORKS[name])
     module.load(arrays)
@@ -243,7 +243,7 @@ def test_the_latent_is_its_mean_at_inference_and_drawn_in_training():
 
 def test_the_latent_has_the_mean_and_the_deviation_that_it_is_drawn_with():
     torch = pytest.importorskip("torch")
-    from stereokit_refiners._torch import Module, _TorchOps
+    from stereokit_refiners.runtimes.torch import Module, _TorchOps
 
     ops = _TorchOps(Module(StereoVae()).train())
     torch.manual_seed(0)
@@ -264,7 +264,7 @@ def test_weights_go_in_and_come_out_as_they_were(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_first_weights_are_those_of_the_seed(name):
     torch = pytest.importorskip("torch")
-    from stereokit_refiners._torch import Module
+    from stereokit_refiners.runtimes.torch import Module
 
     first, again, other = (Module(NETWORKS[name], torch.Generator().manual_seed(seed)).arrays() for seed in (5, 5, 6))
     last = f"{NETWORKS[name].layers[-1].name}.weight"
@@ -275,7 +275,7 @@ def test_first_weights_are_those_of_the_seed(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_reach_every_weight(name):
     torch = pytest.importorskip("torch")
-    from stereokit_refiners._torch import Module, compose
+    from stereokit_refiners.runtimes.torch import Module, compose
 
     module = Module(NETWORKS[name], torch.Generator().manual_seed(0)).train()
     inputs = {key: torch.from_numpy(a)[None] for key, a in encoded_of(name, 16, 16).items()}

@@ -11,9 +11,9 @@ from refining import LEARNED, NAMES, needs_backend, one_line, random_content, we
 from typer.testing import CliRunner
 
 import stereokit
-from stereokit.cli import app
+from stereokit.cli.app import app
 from stereokit.errors import FileError, OptionError, StereokitError
-from stereokit_refiners.network import LearnedRefiner
+from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import shipped
 
 pytestmark = needs_backend

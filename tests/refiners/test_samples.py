@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import stereokit
-from stereokit_refiners import samples
-from stereokit_refiners.samples import Pair, Sample, crop, make_variant, whole
+from stereokit_refiners.training import samples
+from stereokit_refiners.training.samples import Pair, Sample, crop, make_variant, whole
 
 NAN = np.nan
 FIELDS = ("disparity", "confidence", "candidates", "left", "truth", "weight")

@@ -10,8 +10,8 @@ from refining import one_line
 from test_samples import assert_same, pair_of
 
 from stereokit.errors import FileError
-from stereokit_refiners import samples
-from stereokit_refiners.samples import Shelf, cache_name, load_variant, make_variant, store_variant
+from stereokit_refiners.training import samples
+from stereokit_refiners.training.samples import Shelf, cache_name, load_variant, make_variant, store_variant
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_a_shelf_trains_as_its_samples_do(stored, tmp_path):
     from test_training import NETWORKS, fit, settings
     from test_training import assert_same as same_arrays
 
-    from stereokit_refiners.training import Source, calibrated, restored
+    from stereokit_refiners.training.loop import Source, calibrated, restored
 
     network, shelf = NETWORKS["stereokit"], Shelf(stored)
     kept = list(shelf)

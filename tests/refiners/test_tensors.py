@@ -13,9 +13,9 @@ from stereokit.errors import FileError, InputError, OptionError, StereokitError
 torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
+from stereokit_refiners.learned import LearnedRefiner  # noqa: E402
 from stereokit_refiners.linear import Linear  # noqa: E402
-from stereokit_refiners.network import LearnedRefiner  # noqa: E402
-from stereokit_refiners.tensors import TensorRefiner  # noqa: E402
+from stereokit_refiners.runtimes.tensors import TensorRefiner  # noqa: E402
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 TOLERANCE_PX = 2e-3
@@ -76,7 +76,7 @@ def test_only_networks_that_look_at_the_confidence_and_candidates_need_them():
 
 def test_the_device_needs_torch(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "stereokit_refiners.tensors")
+    monkeypatch.delitem(sys.modules, "stereokit_refiners.runtimes.tensors")
     coarse = coarse_of((16, 24))
     for refiner in (Linear(), LearnedRefiner.of(random_content("cnn"))):
         with pytest.raises(StereokitError, match="refiners on the GPU need torch, which is not installed"):

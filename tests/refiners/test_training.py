@@ -18,10 +18,10 @@ torch = pytest.importorskip("torch")
 
 from stereokit import Disparity  # noqa: E402
 from stereokit.errors import OptionError, StereokitError  # noqa: E402
-from stereokit_refiners import training  # noqa: E402
-from stereokit_refiners.network import LearnedRefiner  # noqa: E402
-from stereokit_refiners.samples import Sample  # noqa: E402
-from stereokit_refiners.training import PRESETS, History, Settings, Source, bad_pixels, fit, predict  # noqa: E402
+from stereokit_refiners.learned import LearnedRefiner  # noqa: E402
+from stereokit_refiners.training import loop  # noqa: E402
+from stereokit_refiners.training.loop import PRESETS, History, Settings, Source, bad_pixels, fit, predict  # noqa: E402
+from stereokit_refiners.training.samples import Sample  # noqa: E402
 from stereokit_refiners.weights import NETWORKS, WeightFile  # noqa: E402
 
 TINY = {"steps": 7, "batch": 1, "rows": 8, "columns": 16, "evaluate_every": 2, "half": False, "seed": 3}
@@ -84,12 +84,12 @@ def test_the_papers_recipe():
     assert (paper.form, paper.loss, paper.finish, paper.divergence) == ("literal", "l1", None, 256)
     assert (paper.decay, paper.clip, paper.ema, paper.patience) == (0, 0, 0, 0)
     for step, times in ((0, 0), (1599, 0), (1600, 1), (3200, 2), (159_999, 99)):
-        assert training._rate(paper, step) == pytest.approx(5e-4 * 0.97**times)
+        assert loop._rate(paper, step) == pytest.approx(5e-4 * 0.97**times)
 
 
 def test_the_default_schedule_warms_up_and_ends_near_nothing():
     chosen = Settings(steps=1000, learning_rate=2e-3)
-    rates = [training._rate(chosen, step) for step in range(1000)]
+    rates = [loop._rate(chosen, step) for step in range(1000)]
     assert rates[0] < 0.02 * max(rates)
     assert max(rates) == pytest.approx(2e-3, rel=0.05)
     assert np.argmax(rates) < 110
@@ -173,7 +173,7 @@ def test_exactly_3_pixels_and_exactly_5_percent_are_good():
 def test_predict_is_what_the_refiner_computes(name, form, size):
     pytest.importorskip("safetensors")
     arrays, sample = random_arrays(name, 1), sample_of(1, size)
-    module = training.restored(NETWORKS[name], arrays)
+    module = loop.restored(NETWORKS[name], arrays)
     found = predict(module, form, sample)
     assert found.shape == size
     assert found.dtype == np.float32
@@ -184,7 +184,7 @@ def test_predict_is_what_the_refiner_computes(name, form, size):
 
 
 def test_predict_leaves_the_module_as_it_was():
-    module = training.Module(NETWORKS["stereovae"]).train()
+    module = loop.Module(NETWORKS["stereovae"]).train()
     first = predict(module, "residual", SAMPLES[0])
     assert module.training
     np.testing.assert_array_equal(predict(module, "residual", SAMPLES[0]), first)
@@ -192,17 +192,17 @@ def test_predict_leaves_the_module_as_it_was():
 
 def test_the_score_is_pooled_not_averaged(monkeypatch):
     small, large = sample_of(1, (8, 8)), sample_of(2, (24, 40))
-    monkeypatch.setattr(training, "predict", lambda module, form, sample, half: sample)
-    monkeypatch.setattr(training, "bad_pixels", lambda estimate, sample: (6, 8) if sample is small else (10, 92))
-    assert training._score(None, settings(), [small, large]) == pytest.approx(16.0)
-    assert training._score(None, settings(), []) is None
+    monkeypatch.setattr(loop, "predict", lambda module, form, sample, half: sample)
+    monkeypatch.setattr(loop, "bad_pixels", lambda estimate, sample: (6, 8) if sample is small else (10, 92))
+    assert loop._score(None, settings(), [small, large]) == pytest.approx(16.0)
+    assert loop._score(None, settings(), []) is None
 
 
 def test_batches_are_functions_of_seed_step_and_rank():
     network, chosen = NETWORKS["stereokit"], settings(batch=2)
 
     def draw(step, rank=0, seed=3):
-        return training._draw(network, SOURCES, dataclasses.replace(chosen, seed=seed), step, rank)
+        return loop._draw(network, SOURCES, dataclasses.replace(chosen, seed=seed), step, rank)
 
     first = draw(5)
     assert {k: tuple(v.shape) for k, v in first.items()} == {
@@ -220,7 +220,7 @@ def test_batches_are_functions_of_seed_step_and_rank():
 
 def test_sources_give_their_shares():
     sources = [Source([sample_of(0, offset=1)], 3.0), Source([sample_of(1, offset=50)], 1.0), Source(SAMPLES, 0.0)]
-    drawn = [training._draw(NETWORKS["cnn"], sources, settings(), step) for step in range(200)]
+    drawn = [loop._draw(NETWORKS["cnn"], sources, settings(), step) for step in range(200)]
     far = [float((b["truth"] - torch.nn.functional.interpolate(b["coarse"], scale_factor=2))[b["weight"] > 0].mean())
            for b in drawn]  # fmt: skip
     share = np.mean(np.array(far) > 25)
@@ -231,7 +231,7 @@ def test_sources_give_their_shares():
 def test_the_loss_is_the_weighted_mean_and_the_divergence():
     network, chosen = NETWORKS["stereovae"], settings(divergence=2.0, finish="bounded", steps=9)
     rng = np.random.default_rng(0)
-    batch = training._draw(network, SOURCES, chosen, 0)
+    batch = loop._draw(network, SOURCES, chosen, 0)
     heads = {"map": torch.from_numpy(rng.normal(0, 0.1, (1, 4, 8, 16)).astype(np.float32)),
              "mean": torch.full((1, 1, 2, 4), 0.5), "log_sigma": torch.full((1, 1, 2, 4), -0.2)}  # fmt: skip
     coarse, truth, weight = (batch[n][0, 0].numpy().astype(np.float64) for n in ("coarse", "truth", "weight"))
@@ -240,7 +240,7 @@ def test_the_loss_is_the_weighted_mean_and_the_divergence():
     divergence = oracles.divergence(0.5, np.exp(-0.2))
     for step, pixels in ((0, error), (5, error), (6, 4 * error / (error + 3) + 0.1 * error)):
         expected = (pixels * weight).sum() / weight.sum() + 2 * divergence
-        assert float(training._loss(chosen, network, heads, batch, step)) == pytest.approx(expected, rel=1e-5)
+        assert float(loop._loss(chosen, network, heads, batch, step)) == pytest.approx(expected, rel=1e-5)
 
 
 # --- the loop ------------------------------------------------------------------------------------------------------
@@ -290,7 +290,7 @@ def test_start_weights_are_where_it_starts():
 def test_the_average_is_the_exponential_moving_one():
     network = NETWORKS["cnn"]
     same = {"schedule": "paper", "learning_rate": 1e-2}  # so that the first steps do not depend on how many follow
-    initial = training.Module(network, torch.Generator().manual_seed(3)).arrays()
+    initial = loop.Module(network, torch.Generator().manual_seed(3)).arrays()
     trained = [fit(network, SOURCES, [], settings(steps=n, ema=0.0, **same))[0] for n in (1, 2, 3)]
     found, _ = fit(network, SOURCES, [], settings(steps=3, ema=0.15, **same))
     for name, array in initial.items():
@@ -407,7 +407,7 @@ def scripted(monkeypatch, scores):
         looked_at.append({name: array.copy() for name, array in module.arrays().items()})
         return next(left)
 
-    monkeypatch.setattr(training, "_score", look)
+    monkeypatch.setattr(loop, "_score", look)
     return looked_at
 
 
@@ -479,7 +479,7 @@ def test_the_history_is_a_csv_file():
 def test_calibration_after_training_gives_int8():
     pytest.importorskip("openvino")
     arrays, _ = fit(NETWORKS["stereovae"], SOURCES, [], settings())
-    ranges = training.calibrated(training.restored(NETWORKS["stereovae"], arrays), "residual", SOURCES)
+    ranges = loop.calibrated(loop.restored(NETWORKS["stereovae"], arrays), "residual", SOURCES)
     content = WeightFile("stereovae", "residual", arrays, ranges)
     sample = SAMPLES[0]
     coarse = coarse_map(sample)

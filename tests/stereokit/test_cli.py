@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stereokit import cli, io
+from stereokit import io
+from stereokit.cli.app import app
 from stereokit.errors import OptionError
 from stereokit.result import Disparity
 
@@ -74,7 +75,7 @@ def run(*arguments):
         runner = CliRunner(mix_stderr=False)  # typer before 0.15 mixes them by default
     except TypeError:
         runner = CliRunner()
-    return runner.invoke(cli.app, [str(argument) for argument in arguments])
+    return runner.invoke(app.app, [str(argument) for argument in arguments])
 
 
 def error_of(result):
@@ -272,7 +273,7 @@ def test_interrupt_ends_with_130(tmp_path, pair, monkeypatch):
     assert run("match", *pair, "-o", tmp_path / "d.png").exit_code == 130
     monkeypatch.setattr(sys, "argv", ["stereokit", "match", *pair, "-o", str(tmp_path / "d.png")])
     with pytest.raises(SystemExit) as caught:
-        cli.main()
+        app.main()
     assert caught.value.code == 130
     assert not (tmp_path / "d.png").exists()
 
@@ -280,7 +281,7 @@ def test_interrupt_ends_with_130(tmp_path, pair, monkeypatch):
 def test_main_prints_one_line_and_ends_with_2(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["stereokit", "match", "a.png", "b.png", "-o", str(tmp_path / "d.jpg")])
     with pytest.raises(SystemExit) as caught:
-        cli.main()
+        app.main()
     assert caught.value.code == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -291,7 +292,7 @@ def test_main_prints_one_line_and_ends_with_2(tmp_path, monkeypatch, capsys):
 def test_spinner_waits_a_second(monkeypatch):
     shown = []
     monkeypatch.setattr("rich.status.Status.start", lambda self: shown.append("start"))
-    with cli._waiting("text"):
+    with app._waiting("text"):
         pass
     assert shown == []
 
@@ -372,9 +373,9 @@ def test_own_commands_cannot_be_replaced(monkeypatch):
 def test_importing_the_command_line_is_light():
     code = (
         "import sys; sys.modules['stereokit'] = m = type(sys)('stereokit'); "
-        "m.__path__ = [sys.argv[1]]; import stereokit.cli; "
+        "m.__path__ = [sys.argv[1]]; import stereokit.cli.app; "
         "print(sorted({'numpy', 'numba', 'cv2', 'torch'} & set(sys.modules)))"
     )
-    package = cli.__file__.rsplit("cli.py", 1)[0]
+    package = app.__file__.rsplit("cli.py", 1)[0]
     done = subprocess.run([sys.executable, "-c", code, package], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

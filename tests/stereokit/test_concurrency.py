@@ -16,7 +16,7 @@ import pytest
 
 import stereokit
 from stereokit import InputError, Matcher, match
-from stereokit.kernels import pool
+from stereokit.kernels import threads as workers
 
 METHODS = list(stereokit.METHODS.values())
 
@@ -157,10 +157,10 @@ def test_a_fork_while_locks_are_held_leaves_a_child_that_can_match(run_python):
         import os
         import numpy as np
         from stereokit import match, matching
-        from stereokit.kernels import pool
+        from stereokit.kernels import threads as workers
         image = np.arange(400, dtype=np.uint8).reshape(10, 40)
         expected = match(image, image, "S2", max_disparity=4, threads=2)
-        with matching._matchers_lock, pool._lock:
+        with matching._matchers_lock, workers._lock:
             child = os.fork()
             if child == 0:
                 same = np.array_equal(match(image, image, "S2", max_disparity=4, threads=2), expected)
@@ -187,11 +187,11 @@ def test_workers_are_waited_for_after_an_interrupt():
         time.sleep(0.5)
         ended.append(True)
 
-    pool.run([lambda: None, lambda: None], 2)  # compiles: numba loses signals meanwhile
+    workers.run([lambda: None, lambda: None], 2)  # compiles: numba loses signals meanwhile
     timer = threading.Timer(0.1, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
     timer.start()
     with pytest.raises(KeyboardInterrupt):
-        pool.run([lambda: None, slow], 2)
+        workers.run([lambda: None, slow], 2)
     assert ended == [True]
 
 
@@ -238,7 +238,7 @@ def test_stages_run_one_after_another_and_fail_together():
 
     for threads in (1, 2, 3):
         done.clear()
-        pool.run_stages([[lambda n=n: note(n)] * 4 for n in range(5)], threads)
+        workers.run_stages([[lambda n=n: note(n)] * 4 for n in range(5)], threads)
         assert done == sorted(done) and len(done) == 20
 
     def fail():
@@ -247,21 +247,21 @@ def test_stages_run_one_after_another_and_fail_together():
     for broken in ([fail, lambda: None], [lambda: None, fail]):
         done.clear()
         with pytest.raises(ValueError, match="broken"):
-            pool.run_stages([broken, [lambda: note(1)] * 2], 2)
+            workers.run_stages([broken, [lambda: note(1)] * 2], 2)
         assert not done
-    pool.run([lambda: note(0)] * 2, 2)
+    workers.run([lambda: note(0)] * 2, 2)
     assert done == [0, 0]
 
 
 def test_a_crew_outlives_its_runs_and_a_failure_in_one():
     done = []
-    with pool.crew(2):
+    with workers.crew(2):
         for n in range(50):
-            pool.run([lambda n=n: done.append(n), lambda n=n: done.append(n)], 2)
+            workers.run([lambda n=n: done.append(n), lambda n=n: done.append(n)], 2)
     assert sorted(done) == sorted([*range(50)] * 2)
-    with pytest.raises(ZeroDivisionError), pool.crew(2):
-        pool.run([lambda: None, lambda: 1 / 0], 2)
-    pool.run([lambda: done.append(-1)] * 2, 2)
+    with pytest.raises(ZeroDivisionError), workers.crew(2):
+        workers.run([lambda: None, lambda: 1 / 0], 2)
+    workers.run([lambda: done.append(-1)] * 2, 2)
     assert done[-2:] == [-1, -1]
 
 

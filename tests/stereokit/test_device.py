@@ -9,8 +9,8 @@ import textwrap
 import pytest
 
 from stereokit import Matcher
+from stereokit.cuda import driver
 from stereokit.errors import DeviceError, InputError, OptionError, StereokitError
-from stereokit.kernels import device
 
 
 @pytest.fixture
@@ -21,9 +21,9 @@ def no_driver(monkeypatch):
         raise OSError(name)
 
     monkeypatch.setattr(ctypes, "CDLL", fail)
-    device._driver.cache_clear()
+    driver._driver.cache_clear()
     yield
-    device._driver.cache_clear()
+    driver._driver.cache_clear()
 
 
 class _Driver:
@@ -57,10 +57,10 @@ def with_driver(monkeypatch):
 
     def give(count):
         monkeypatch.setattr(ctypes, "CDLL", lambda name: _Driver(count))
-        device._driver.cache_clear()
+        driver._driver.cache_clear()
 
     yield give
-    device._driver.cache_clear()
+    driver._driver.cache_clear()
 
 
 def test_cuda_without_a_driver_says_what_to_do(no_driver):
@@ -82,10 +82,10 @@ def test_auto_falls_back_in_silence(no_driver, recwarn, capsys):
 
 def test_a_driver_without_a_gpu(with_driver):
     with_driver(0)
-    assert not device.has_device()
+    assert not driver.has_device()
     with pytest.raises(DeviceError, match="the NVIDIA driver finds no GPU"):
-        device.require_device()
-    assert device.describe() == "none (the NVIDIA driver finds no GPU)"
+        driver.require_device()
+    assert driver.describe() == "none (the NVIDIA driver finds no GPU)"
 
 
 def test_a_gpu_without_numba_cuda(with_driver, monkeypatch):
@@ -99,8 +99,8 @@ def test_a_gpu_without_numba_cuda(with_driver, monkeypatch):
 def test_a_gpu_is_described(with_driver, monkeypatch):
     with_driver(1)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    assert device.has_device()
-    assert device.describe() == "Emulated 9000, compute capability 8.7"
+    assert driver.has_device()
+    assert driver.describe() == "Emulated 9000, compute capability 8.7"
 
 
 @pytest.mark.parametrize("wrong", ["gpu", None, 0, "CUDA"])
@@ -124,7 +124,7 @@ def test_neither_matching_nor_asking_for_a_gpu_imports_numba_cuda(run_python):
         import sys
         import numpy as np
         import stereokit
-        from stereokit.kernels.device import describe, has_device
+        from stereokit.cuda.driver import describe, has_device
         describe()
         if not has_device():
             matcher = stereokit.Matcher("S2", device="auto")

@@ -8,7 +8,7 @@ import pytest
 
 import stereokit
 from stereokit import InputError, Matcher, OptionError, StereokitError, UnknownNameError, match
-from stereokit.inputs import gray_pair, half_size, smooth
+from stereokit.images.gray import gray_pair, half_size, smooth
 
 METHOD = "census+sgm"
 KEEP_ALL = {"fill": None, "smp": False, "speckle": 0, "uniqueness": 0, "median": 0}

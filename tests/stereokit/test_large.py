@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import stereokit
-from stereokit import cli
+from stereokit.cli.app import app
 from stereokit.errors import FileError, InputError, OptionError, StereokitError
 from stereokit.large import matching, memory
 from stereokit.large.output import write_bands
@@ -122,7 +122,7 @@ def seam_error(tmp_path, left, right, method, overlap, **options):
 @pytest.mark.parametrize("method", METHODS)
 def test_seams_fade_with_the_overlap(method, tmp_path, cut):
     pytest.importorskip("skimage")
-    from stereokit_evaluation.scenes import generate
+    from stereokit_evaluation.synthetic.scenes import generate
 
     scene = generate(3, 400, 704, 64)
     found = {}
@@ -379,10 +379,10 @@ def test_the_command_matches_in_windows(tmp_path, monkeypatch, run_python):
     np.save("r.npy", right)
     words = ["match", "l.npy", "r.npy", "-o", "out.npy", "--method", "S2", "--max-disparity", "16"]
     # In a process of its own: the bound is that of all that a process occupies, and this one may hold more by now.
-    run_python("-m", "stereokit.cli", *words, "--memory", "2GB", "--json", "out.json")
+    run_python("-m", "stereokit.cli.app", *words, "--memory", "2GB", "--json", "out.json")
     np.testing.assert_array_equal(np.load("out.npy"), stereokit.match(left, right, "S2", max_disparity=16))
     report = json.loads((tmp_path / "out.json").read_text())
     assert report["windows"] == 1 and report["window"] == {"height": 60, "width": 100} and report["memory"] == "2GB"
     for extra in (["--color", "c.png"], ["--right", "r2.npy"], ["--memory", "much"]):
-        refused = CliRunner().invoke(cli.app, [*words, "--memory", "2GB", *extra])
+        refused = CliRunner().invoke(app.app, [*words, "--memory", "2GB", *extra])
         assert refused.exit_code == 2 and "error: " in refused.output

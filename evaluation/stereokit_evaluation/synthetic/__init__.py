@@ -1,1 +1,1 @@
-"""Generated stereo pairs with exact truth: rooms, objects, piles, terrain, close-ups, outdoor scenes, streets."""
+"""Scenes with exact ground truth: the streets of `scenes`, and the pairs of many kinds of `generated`."""

@@ -250,7 +250,7 @@ def _wood(rng: Rng) -> Float:
 
 def _photograph(rng: Rng) -> Float:
     """Return a part of a photograph, mirrored or turned."""
-    from stereokit_evaluation._textures import photograph
+    from stereokit_evaluation.synthetic.textures import photograph
 
     image: Any = photograph(PHOTOGRAPHS[int(rng.integers(len(PHOTOGRAPHS)))])
     if image.ndim == 3:

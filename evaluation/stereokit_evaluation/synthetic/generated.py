@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit_evaluation.scenes import generate
+from stereokit_evaluation.synthetic.scenes import generate
 from stereokit_evaluation.synthetic.closeups import closeup
 from stereokit_evaluation.synthetic.objects import flying, pile
 from stereokit_evaluation.synthetic.outdoor import garden, road

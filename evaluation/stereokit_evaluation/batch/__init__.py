@@ -1,0 +1,1 @@
+"""Many pairs: found, matched, stored, resumed."""

@@ -1,0 +1,131 @@
+"""What is done for one pair of a batch, in a thread of this machine or in a worker of a cluster: read, match, write.
+
+Whatever goes wrong with a pair becomes a line of its outcome. Matchers are kept by job, so that a process compiles
+and allocates once.
+"""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from stereokit.errors import InputError, StereokitError
+from stereokit.io import read_image, write_disparity, write_image
+from stereokit.matching import Matcher
+from stereokit.result import colorize
+from stereokit_evaluation.batch.store import COLOR, publish, target_of
+
+__all__ = ["Job", "Outcome", "describe", "matcher_of", "work"]
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all pairs of a batch have in common; hashable, and the same in every process.
+
+    Attributes
+    ----------
+    folder : str
+        Where outputs go, absolute.
+    suffix : str
+        Of the maps, with its dot.
+    color : bool
+        Also write a coloured picture.
+    method : str
+    options : tuple of (str, value)
+        Of `stereokit.Matcher`.
+    """
+
+    folder: str
+    suffix: str
+    color: bool
+    method: str
+    options: tuple[tuple[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one pair.
+
+    Attributes
+    ----------
+    name : str
+    written : bool
+        False if there was such a map already, or none could be made.
+    reason : str
+        Why there is none, in one line; empty if there is one.
+    fatal : bool
+        Nothing more can be written.
+    seconds : float
+        From reading to writing.
+    """
+
+    name: str
+    written: bool = False
+    reason: str = ""
+    fatal: bool = False
+    seconds: float = 0.0
+
+
+def work(job: Job, name: str, left: str | NDArray[Any], right: str | NDArray[Any]) -> Outcome:
+    """Make the map of one pair, unless it is there.
+
+    Parameters
+    ----------
+    job : Job
+    name : str
+    left, right : str or array
+        Files, or the images themselves.
+    """
+    start = time.perf_counter()
+    try:
+        folder = Path(job.folder)
+        target = target_of(folder, name, job.suffix)
+        if target.exists():  # a worker that died had got that far
+            return Outcome(name)
+        images = [read_image(image) if isinstance(image, str) else image for image in (left, right)]
+        if images[0].shape[:2] != images[1].shape[:2]:
+            sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
+            raise InputError(f"left and right must have the same size, got {sizes}")
+        matcher = matcher_of(job)
+        disparity = matcher(*images).disparity
+        if job.color:  # first: the map says that all is done
+            picture = folder / COLOR / f"{name}.png"
+            picture.parent.mkdir(parents=True, exist_ok=True)
+            write_image(picture, colorize(disparity, matcher.min_disparity, matcher.max_disparity))
+        written = publish(folder, target, lambda path: write_disparity(path, disparity))
+        return Outcome(name, written, seconds=time.perf_counter() - start)
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, OSError):
+            cause = cause.__cause__
+        fatal = cause is not None and cause.errno in _FULL
+        return Outcome(name, False, describe(error), fatal, time.perf_counter() - start)
+
+
+def describe(error: BaseException) -> str:
+    """Return an error in one line, with its type unless it is one of ours."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, StereokitError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
+
+
+_matchers: dict[Job, Matcher] = {}
+_lock = threading.Lock()
+
+
+def matcher_of(job: Job) -> Matcher:
+    """Return the job's matcher, one thread a call; the last one is kept."""
+    with _lock:
+        found = _matchers.get(job)
+        if found is None:
+            found = Matcher(job.method, threads=1, **dict(job.options))
+            _matchers.clear()
+            _matchers[job] = found
+        return found

@@ -1,0 +1,221 @@
+"""The command ``stereokit batch``: maps of all pairs of a folder, a list or a video, on this machine or on a cluster.
+
+What is there already is left alone, so that the same command goes on after an interrupt, a kill or a full disk. A pair
+that fails is named and costs nobody else anything. For scripts there is `stereokit_evaluation.batch.run.run_batch`;
+what a folder and a list may look like is told in `stereokit_evaluation.batch.pairs`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from stereokit.cli.options import (
+    DeviceOption,
+    FillOption,
+    JsonOption,
+    MaxDisparityOption,
+    MethodOption,
+    MinDisparityOption,
+    RefinerOption,
+    ScaleOption,
+    SettingsOption,
+    check_fits_png,
+    check_json,
+    parse_settings,
+    write_json,
+)
+from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit.images.gray import check_integer
+from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES
+from stereokit_evaluation.batch.job import Job, matcher_of
+from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
+from stereokit_evaluation.batch.run import Engine, Summary, identity, on_threads, run_batch
+from stereokit_evaluation.batch.store import write_document
+from stereokit_evaluation.batch.video import Video
+from stereokit_evaluation.common.progress import progress
+
+__all__ = ["batch", "find_pairs"]
+
+_OWN_OPTIONS = frozenset("method max_disparity min_disparity scale refiner fill device threads".split())
+_FORMATS = tuple(suffix[1:] for suffix in DISPARITY_SUFFIXES)
+_SHOWN_ERRORS = 10
+
+
+def batch(
+    inputs: Annotated[list[Path], typer.Argument(help="A folder, a list or a video; or two folders or two videos.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the maps, NAME.FORMAT.")],
+    method: MethodOption = "zncc+sgm",
+    max_disparity: MaxDisparityOption = 128,
+    min_disparity: MinDisparityOption = 0,
+    scale: ScaleOption = 1.0,
+    refiner: RefinerOption = None,
+    fill: FillOption = None,
+    device: DeviceOption = "auto",
+    settings: SettingsOption = None,
+    file_format: Annotated[str, typer.Option("--format", help="png (KITTI), pfm, npy or tiff.")] = "png",
+    color: Annotated[bool, typer.Option("--color", help="Also coloured pictures, in DIR/color.")] = False,
+    pattern: Annotated[
+        tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Files of a folder, '*_l.png' '*_r.png'.")
+    ] = None,
+    engine: Annotated[str, typer.Option(help="local or dask.")] = "local",
+    scheduler: Annotated[str | None, typer.Option(help="Address or file of the Dask scheduler.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Pairs at a time, local; all processors by default.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Make all maps anew.")] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Match all pairs of a folder, a list or a video; go on where an earlier run ended.
+
+    A folder has left and right, or image_2 and image_3, or files NAME_left and NAME_right; a list has lines
+    left,right[,name]; a video has both views side by side, or is two files. Maps that are there are not made again,
+    and must come from the same inputs and options. Pairs that fail are named, and the exit status is then 1.
+    """
+    check_json(json_file)
+    if file_format not in _FORMATS:
+        raise OptionError(f"format must be one of {', '.join(_FORMATS)}, got {file_format!r}")
+    if file_format == "png":
+        check_fits_png("--format png", min_disparity, max_disparity)
+    options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
+    given = {"refiner": refiner, "fill": fill}
+    options.update({name: value for name, value in given.items() if value is not None})
+    options["device"] = device
+    options.update(parse_settings(settings or (), _OWN_OPTIONS))
+    for name in ("right", "confidence"):
+        if options.get(name):
+            raise OptionError(f"{name} is not written by batch, only the map of the left view is")
+    if refiner is not None and refiner.endswith(".safetensors"):
+        options["refiner"] = os.path.abspath(refiner)
+    where = os.path.abspath(output)
+    job = Job(where, f".{file_format}", color, method, tuple(sorted(options.items())))
+    matcher_of(job)  # refuses what cannot be
+    run_on, engine_options, client = _engine(engine, scheduler, workers)
+    try:
+        source, origin = find_pairs(inputs, pattern)
+        total = source.expected if isinstance(source, Video) else len(source)
+        summary = _run(job, source, run_on, origin, overwrite, total)
+    finally:
+        if client is not None:
+            client.close()
+    if isinstance(source, Video) and source.expected and summary.pairs < source.expected and not summary.interrupted:
+        summary.notes.append(f"the video says {source.expected} frames, {summary.pairs} could be read")
+    document = {**summary.as_json(), "output": where, **engine_options, "options": identity(job, origin)}
+    if Path(where).is_dir():
+        write_document(Path(where) / "summary.json", document)
+    printed = write_json(json_file, document)
+    _finish(summary, job, printed)
+
+
+def find_pairs(inputs: Sequence[Path], pattern: tuple[str, str] | None = None) -> tuple[list[Pair] | Video, list[str]]:
+    """Return the pairs that the inputs of the command have, and what a manifest calls the inputs.
+
+    Parameters
+    ----------
+    inputs : sequence of Path
+        One folder, list or video; or two folders or videos, left and right.
+    pattern : (left, right) or None
+        For one folder: names of files with one ``*``.
+
+    Raises
+    ------
+    FileError
+        If there are no pairs, or a file cannot be read.
+    OptionError
+        If the inputs do not go together.
+    """
+    for path in inputs:
+        if not path.exists():
+            raise FileError(f"no such file or folder: {str(path)!r}")
+        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:  # which OpenCV would take for a video of one frame
+            raise OptionError(
+                f"inputs must be folders, lists or videos, got the image {str(path)!r}; for one pair: match"
+            )
+    origin = [os.path.abspath(path) for path in inputs]
+    if pattern is not None:
+        if len(inputs) != 1 or not inputs[0].is_dir():
+            raise OptionError("pattern needs one folder as input")
+        return folder_pairs(inputs[0], pattern), [*origin, *pattern]
+    if len(inputs) == 1:
+        if inputs[0].is_dir():
+            return folder_pairs(inputs[0]), origin
+        if inputs[0].suffix.lower() in LIST_SUFFIXES:
+            return list_pairs(inputs[0]), origin
+        return Video(inputs[0]), origin
+    if len(inputs) != 2:
+        raise OptionError(f"inputs must be one or two, got {len(inputs)}")
+    if all(path.is_dir() for path in inputs):
+        return folders_pairs(*inputs), origin
+    if any(path.is_dir() or path.suffix.lower() in LIST_SUFFIXES for path in inputs):
+        raise OptionError("two inputs must be two folders or two videos, left and right")
+    return Video(*inputs), origin
+
+
+def _engine(name: str, scheduler: str | None, workers: int | None) -> tuple[Engine, dict[str, Any], Any]:
+    if name not in ("local", "dask"):
+        raise OptionError(f"engine must be local or dask, got {name!r}")
+    if (name == "dask") != (scheduler is not None):
+        raise OptionError("--engine dask and --scheduler go together, got only one of them")
+    if name == "local":
+        if workers is not None:
+            check_integer("workers", workers, 1, 1024)
+        return partial(on_threads, workers=workers), {"engine": name, "workers": workers}, None
+    if workers is not None:
+        raise OptionError("--workers is for --engine local; a cluster has its own")
+    assert scheduler is not None
+    from stereokit_evaluation.batch.dask import connect, on_cluster
+
+    client = connect(scheduler)
+    return partial(on_cluster, client=client), {"engine": name, "scheduler": scheduler}, client
+
+
+def _run(
+    job: Job, source: list[Pair] | Video, run_on: Engine, origin: list[str], overwrite: bool, total: int | None
+) -> Summary:
+    seen = told = 0
+    with progress(total) as (console, step):
+
+        def show(summary: Summary) -> None:
+            nonlocal seen, told
+            while told < min(len(summary.errors), _SHOWN_ERRORS):
+                name, reason = summary.errors[told]
+                console.print(f"failed {name}: {reason}", markup=False, highlight=False, soft_wrap=True)
+                told += 1
+            rate = summary.pairs_per_second
+            step("" if rate is None else f"{rate:.1f} pairs/s", summary.pairs - seen)
+            seen = summary.pairs
+
+        summary = run_batch(job, source, run_on, inputs=origin, overwrite=overwrite, progress=show)
+        if len(summary.errors) > told:
+            more = f"... and {len(summary.errors) - told} more, all in summary.json"
+            console.print(more, markup=False, highlight=False)
+        if summary.interrupted:
+            console.print("interrupted: the same command goes on from here", highlight=False)
+    return summary
+
+
+def _finish(summary: Summary, job: Job, printed: bool) -> None:
+    for note in summary.notes:
+        typer.echo(f"note: {note}", err=True)
+    if not printed:
+        table = Table(box=SIMPLE_HEAD, pad_edge=False)
+        for head in ("method", "pairs", "written", "there before", "failed", "seconds", "pairs/s"):
+            table.add_column(head, justify="left" if head == "method" else "right", no_wrap=True)
+        rate = summary.pairs_per_second
+        counts = (summary.pairs, summary.written, summary.found, summary.failed)
+        seconds = f"{summary.seconds:.1f}", "-" if rate is None else f"{rate:.2f}"
+        table.add_row(matcher_of(job).method, *map(str, counts), *seconds)
+        Console(width=None if sys.stdout.isatty() else 120).print(table)
+    if summary.interrupted:
+        raise typer.Exit(130)
+    if summary.stopped:
+        raise StereokitError(f"{summary.stopped}; {summary.written} maps were written")
+    if summary.failed:
+        raise typer.Exit(1)

@@ -1,0 +1,203 @@
+"""The command ``stereokit evaluate``: methods, or finished maps, scored on a data set in one table.
+
+Scores are those of the KITTI 2015 development kit (`stereokit_evaluation.scoring.kitti`), pooled over images. A
+column counts only the images that have its ground truth. For scripts there is `run`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from stereokit import __version__
+from stereokit.cli.options import DeviceOption, JsonOption, check_json, parse_settings, write_json
+from stereokit.errors import OptionError
+from stereokit.io import write_image
+from stereokit_evaluation.common.folders import make_folder
+from stereokit_evaluation.common.progress import progress
+from stereokit_evaluation.data.datasets import load, select
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.scoring.error_map import error_map
+from stereokit_evaluation.scoring.runner import (
+    Estimate,
+    Estimator,
+    Result,
+    Scored,
+    Skipped,
+    from_files,
+    run,
+    score_frames,
+    seen_in_training,
+    with_matcher,
+)
+from stereokit_evaluation.scoring.summary import figures
+
+__all__ = ["Result", "evaluate", "run"]
+
+_DEFAULT_METHOD = "zncc+sgm"
+_DEFAULT_DISPARITIES = 128
+_OWN_OPTIONS = frozenset(("method", "scale", "refiner", "device", "threads", "max_disparity"))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One row of the table: what is scored, and the words that describe it."""
+
+    estimate: Estimator
+    method: str
+    scale: float | None = None
+    refiner: str | None = None
+    device: str | None = None
+    matcher: Any = None
+
+
+def evaluate(
+    dataset: Annotated[str, typer.Option(help="kitti2015, kitti2012, middlebury, eth3d, folder or scenes.")],
+    root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
+    frames: Annotated[str | None, typer.Option(help="Numbers or names, such as 0-3,34-40.")] = None,
+    method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,
+    scale: Annotated[float, typer.Option(help="1, or 0.5 to match at half size.")] = 1.0,
+    refiner: Annotated[str | None, typer.Option(help="Refiner for the half-size map.")] = None,
+    predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")] = None,
+    max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
+    device: DeviceOption = "auto",
+    color: Annotated[bool, typer.Option("--color/--gray", help="Images as stored, or grey.")] = False,
+    count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
+    error_maps: Annotated[Path | None, typer.Option(help="Write error maps to METHOD/NAME.png here.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Score matching methods, or finished disparity maps, against ground truth as KITTI 2015 does.
+
+    Frames that cannot be read are named on standard error and left out; the exit status is then 1.
+    """
+    check_json(json_file)
+    chosen = select(load(dataset, root, count=count), frames)
+    options: dict[str, Any]
+    if predictions is not None:
+        given: dict[str, Any] = {"method": method, "refiner": refiner, "set": settings, "threads": threads}
+        given |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
+        for name in (name for name, value in given.items() if value is not None and value != []):
+            raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")
+        options = {"predictions": str(predictions)}
+        runs = [_Run(from_files(predictions), "predictions")]
+    else:
+        suggested = [frame.max_disparity for frame in chosen if frame.max_disparity is not None]
+        if max_disparity is None:
+            max_disparity = max(suggested, default=_DEFAULT_DISPARITIES)
+        options = {"max_disparity": max_disparity, "threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
+        methods = method or [_DEFAULT_METHOD]
+        runs = [_matcher_run(name, scale, refiner, device, options, color) for name in methods]
+    seen = (seen_in_training(job.matcher, dataset, chosen) for job in runs)
+    for line in dict.fromkeys(line for line in seen if line is not None):
+        typer.echo(f"note: {line}", err=True)
+    results, interrupted = _execute(runs, chosen, error_maps)
+    skipped = list(dict.fromkeys(skip for result in results for skip in result.skipped))
+    document = {
+        "results": [_as_json(job, result) for job, result in zip(runs, results, strict=False)],
+        "dataset": dataset,
+        "options": {**options, "color": color, "frames": frames},
+        "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in skipped],
+        "interrupted": interrupted,
+        "version": __version__,
+    }
+    if not write_json(json_file, document):
+        _print_table(f"{dataset}, {len(chosen)} frames", runs, results)
+    if interrupted:
+        raise typer.Exit(130)
+    if skipped:
+        raise typer.Exit(1)
+
+
+def _matcher_run(
+    method: str, scale: float, refiner: str | None, device: str, options: dict[str, Any], color: bool
+) -> _Run:
+    from stereokit import Matcher
+
+    matcher = Matcher(method, scale=scale, refiner=refiner, device=device, **options)
+    estimate = with_matcher(matcher, gray=not color)
+    return _Run(estimate, str(matcher.method), scale, refiner, str(matcher.device), matcher)
+
+
+def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -> tuple[list[Result], bool]:
+    """Run all, printing skipped frames as they come; an interrupt ends the work and keeps what was done."""
+    results: list[Result] = []
+    told: set[Skipped] = set()
+    with progress(len(runs) * len(frames)) as (console, step):
+        for job in runs:
+            scored: list[Scored] = []
+            skipped: list[Skipped] = []
+            draw = None if maps is None else _draws(maps / job.method)
+            try:
+                for outcome in score_frames(frames, job.estimate, draw):
+                    if isinstance(outcome, Scored):
+                        scored.append(outcome)
+                    else:
+                        skipped.append(outcome)
+                        if outcome not in told:
+                            line = f"skipped {outcome.name}: {outcome.reason}"
+                            console.print(line, markup=False, highlight=False, soft_wrap=True)
+                            told.add(outcome)
+                    step(f"{job.method} {outcome.name}")
+            except KeyboardInterrupt:
+                console.print("interrupted: the figures cover the frames done so far", highlight=False)
+                return [*results, Result(tuple(scored), tuple(skipped))], True
+            results.append(Result(tuple(scored), tuple(skipped)))
+    return results, False
+
+
+def _draws(folder: Path) -> Callable[..., None]:
+    make_folder(folder, "error_maps")
+
+    def draw(frame: Frame, found: Estimate, noc: NDArray[Any] | None, occ: NDArray[Any] | None) -> None:
+        everything = noc if occ is None else occ
+        if everything is None:
+            return
+        name = frame.name.replace("/", "_")
+        write_image(folder / f"{name}.png", error_map(found.disparity, everything, noc))
+
+    return draw
+
+
+def _print_table(title: str, runs: Sequence[_Run], results: Sequence[Result]) -> None:
+    table = Table(title=title, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    table.add_column("method", no_wrap=True)
+    heads = ("images", "D1 noc", "bg", "fg", "D1 occ", "bad-2", "EPE", "density", "ms")
+    for head in heads:
+        table.add_column(head, justify="right")
+    for job, result in zip(runs, results, strict=False):
+        noc, occ, main = result.score.noc, result.score.occ, result.score.main
+        seconds = result.seconds_per_image
+        figures = (
+            *(part.filled.d1() for part in (noc.all, noc.bg, noc.fg, occ.all)),
+            main.filled.bad_x(2.0),
+            main.filled.epe(),
+        )
+        table.add_row(
+            " ".join(str(word) for word in (job.method, job.refiner, _half(job.scale)) if word),
+            str(len(result.frames)),
+            *("-" if figure is None else f"{figure:.2f}" for figure in figures),
+            "-" if (density := main.density()) is None else f"{density:.1f}",
+            "-" if seconds is None else f"{1000 * seconds:.1f}",
+        )
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+def _half(scale: float | None) -> str:
+    return "" if scale in (None, 1.0) else f"x{scale:g}"
+
+
+def _as_json(job: _Run, result: Result) -> dict[str, Any]:
+    """Return one entry of ``results``."""
+    described = {"method": job.method, "scale": job.scale, "refiner": job.refiner, "device": job.device}
+    return {**described, **figures(result)}

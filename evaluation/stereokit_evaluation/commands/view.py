@@ -1,0 +1,117 @@
+"""The command ``stereokit view``: one pair in the viewer of the reports, as one HTML file."""
+
+from __future__ import annotations
+
+import time
+import webbrowser
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from stereokit import Matcher, __version__
+from stereokit.calibration import read_calibration
+from stereokit.cli.options import (
+    DeviceOption,
+    JsonOption,
+    MaxDisparityOption,
+    MinDisparityOption,
+    ScaleOption,
+    check_json,
+    parse_settings,
+    write_json,
+)
+from stereokit.errors import InputError, OptionError
+from stereokit.io import check_output, read_disparity, read_image, write_bytes
+from stereokit_evaluation.report import viewer
+from stereokit_evaluation.report.page import render, require
+from stereokit_evaluation.scoring.kitti import score
+from stereokit_evaluation.study.configurations import title
+
+__all__ = ["view"]
+
+
+def view(
+    left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a rectified pair.")],
+    right: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The .html file to write.")],
+    method: Annotated[list[str] | None, typer.Option("--method", "-m", help="S1 to S4; may repeat.")] = None,
+    max_disparity: MaxDisparityOption = 128,
+    min_disparity: MinDisparityOption = 0,
+    scale: ScaleOption = 1.0,
+    refiner: Annotated[list[str] | None, typer.Option(help="For --scale 0.5; may repeat.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
+    device: DeviceOption = "auto",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage; may repeat.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Middlebury, KITTI or JSON calibration, for metres.")
+    ] = None,
+    cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
+    truth: Annotated[Path | None, typer.Option(metavar="FILE", help="True disparity, for errors.")] = None,
+    open_browser: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Match LEFT and RIGHT and write a page to look at: image, disparity, error, point cloud.
+
+    Without a calibration there is no depth, and the point cloud is in pixels.
+    """
+    check_output(output, (".html", ".htm"), "output")
+    check_json(json_file)
+    require("jinja2")
+    if refiner and scale == 1:
+        raise OptionError(f"refiner needs --scale 0.5, got {', '.join(refiner)} with scale 1")
+    options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
+    options |= {"threads": threads, "device": device, **parse_settings(settings or ())}
+    names = list(dict.fromkeys(method or ["S4"]))
+    refiners: list[str | None] = [*refiner] if refiner else [None]
+    matchers = {
+        f"{name} {title(refine or 'linear') if scale != 1 else ''}".strip(): Matcher(name, refiner=refine, **options)
+        for name in names
+        for refine in refiners
+    }
+    images = read_image(left), read_image(right)
+    if images[0].shape != images[1].shape:
+        sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
+        raise InputError(f"LEFT and RIGHT must have the same size and number of channels, got {sizes}")
+    camera = None if calibration is None else read_calibration(calibration, cameras)
+    if camera is not None:
+        camera.check_size(images[0].shape[1], images[0].shape[0])
+    known = None if truth is None else read_disparity(truth)
+    if known is not None and known.shape != images[0].shape[:2]:
+        raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {known.shape}")
+    maps, seconds = [], {}
+    for name, matcher in matchers.items():
+        matcher(*images)  # compiles, so that the time below is that of matching
+        begun = time.perf_counter()
+        found = matcher(*images)
+        seconds[name] = time.perf_counter() - begun
+        note = f"{1000 * seconds[name]:.0f} ms"
+        if known is not None:
+            d1 = score(found.disparity, occ=known, measured=found.valid).occ.all.filled.d1()
+            note += "" if d1 is None else f", D1 {d1:.2f} %"
+        maps.append(viewer.Shown(name, found.disparity, found.valid, note))
+    pair = viewer.pair(left.name, images[0], maps, occ=known, calibration=camera)
+    page = render(
+        "view.html.j2", [pair], title=_title(left, right), version=__version__,
+        maps=maps, methods=[maps[0].name, maps[-1].name],
+    )  # fmt: skip
+    write_bytes(output, page)
+    report = {
+        "left": str(left), "right": str(right), "output": str(output), "bytes": len(page),
+        "methods": list(matchers), "seconds": seconds, "calibration": None if calibration is None else str(calibration),
+        "density": {shown.name: float(np.mean(shown.valid)) for shown in maps}, "version": __version__,
+    }  # fmt: skip
+    if not write_json(json_file, report):
+        without = "" if camera is not None else "; no calibration: no depth, and the point cloud is in pixels"
+        typer.echo(f"{output} ({len(page) / 1e6:.1f} MB){without}")
+    if open_browser:
+        webbrowser.open(output.resolve().as_uri())
+
+
+def _title(left: Path, right: Path) -> str:
+    """Return the files' names, with their folders where the names alone are the same."""
+    parts = 1 if left.name != right.name else 2
+    return " and ".join("/".join(path.resolve().parts[-parts:]) for path in (left, right))

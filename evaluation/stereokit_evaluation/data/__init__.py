@@ -1,0 +1,1 @@
+"""Data sets: frames with ground truth, splits, published figures."""

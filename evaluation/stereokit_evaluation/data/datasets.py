@@ -1,0 +1,330 @@
+"""Stereo data sets as lists of frames that load when asked.
+
+Each function reads one published layout, or one of our own, and returns frames sorted by name. Nothing but
+file names is read until a frame's ``load_`` method is called, so that a broken file costs one frame and not
+the run. Ground truth comes in two kinds, as in KITTI: *noc*, the pixels that both cameras see, and *occ*, all
+pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.calibration import Calibration, read_calibration
+from stereokit.errors import FileError, OptionError, UnknownNameError, did_you_mean
+from stereokit.io import read_disparity, read_image
+from stereokit_evaluation.data.frame import Frame, Loader, select
+
+__all__ = [
+    "DATASETS",
+    "Frame",
+    "eth3d",
+    "folder",
+    "kitti2012",
+    "kitti2015",
+    "load",
+    "middlebury",
+    "scenes",
+    "select",
+]
+
+_KITTI_DISPARITIES = 128  # the study's D; a few pixels of the ground truth lie beyond
+_LEVELS = {"2001": 8, "2003": 4, "2006": 3}  # levels a pixel in the 8-bit disparity maps
+_WIDEST = {"2001": 1000, "2003": 450, "2006": 480}  # a wider image is of a larger edition, with other levels
+_SCENE_SIZE = (640, 384)  # width, height
+_IMAGES = (".png", ".ppm", ".pgm", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_MAPS = (".png", ".pfm", ".npy")
+
+
+def kitti2015(root: str | Path) -> list[Frame]:
+    """Return the frames of KITTI 2015: ``image_2``, ``image_3``, ``disp_noc_0``, ``disp_occ_0``, ``obj_map``.
+
+    Parameters
+    ----------
+    root : str or Path
+        The folder that holds ``training``, or ``training`` itself. Only the first pair of each frame,
+        ``*_10``.
+    """
+    return _kitti("KITTI 2015", root, [("image_2", "image_3")], ("disp_noc_0", "disp_occ_0", "obj_map"))
+
+
+def kitti2012(root: str | Path) -> list[Frame]:
+    """Return the frames of KITTI 2012: ``image_0``, ``image_1``, ``disp_noc`` and ``disp_occ``.
+
+    Parameters
+    ----------
+    root : str or Path
+        The folder that holds ``training``, or ``training`` itself. ``colored_0/1`` or ``colour_0/1`` serve
+        where there is no ``image_0``.
+    """
+    pairs = [("image_0", "image_1"), ("colored_0", "colored_1"), ("colour_0", "colour_1")]
+    return _kitti("KITTI 2012", root, pairs, ("disp_noc", "disp_occ", "obj_map"))
+
+
+def middlebury(root: str | Path) -> list[Frame]:
+    """Return the Middlebury pairs in any folder at or below `root`, named by their folder.
+
+    * 2001 (``im2``, ``im6``, ``disp2``: 8 levels a pixel) and 2003, quarter size (the same names in a folder
+      ``cones`` or ``teddy``, or below one called 2003: 4 levels a pixel, and ``mask_nonocc`` for *noc*).
+    * 2005 and 2006, third size (``view1``, ``view5``, ``disp1``: 3 levels a pixel). No *noc*.
+    * 2014 and later (``im0``, ``im1``, ``disp0GT.pfm`` or ``disp0.pfm``, ``mask0nocc.png``, ``calib.txt``).
+
+    In the 8-bit maps 0 is unknown. Larger editions of 2003 to 2006 have other levels; their maps are refused
+    when they are loaded.
+    """
+    base = _root(root)
+    frames = [*_with_calibration(base)]
+    for path in _images_below(base):
+        if path.stem == "im2":
+            modern = path.parent.name.lower() in ("cones", "teddy") or "2003" in path.parts
+            frames.append(_scaled(base, "2003" if modern else "2001", path, "im6", "disp2"))
+        elif path.stem == "view1":
+            frames.append(_scaled(base, "2006", path, "view5", "disp1"))
+    wanted = "folders with im0.png, im1.png, disp0GT.pfm or im2, im6, disp2 or view1, view5, disp1"
+    return _found("Middlebury", frames, base, wanted)
+
+
+def eth3d(root: str | Path) -> list[Frame]:
+    """Return the ETH3D pairs below `root`: ``im0.png``, ``im1.png``, ``disp0GT.pfm``, ``mask0nocc.png``."""
+    base = _root(root)
+    return _found("ETH3D", [*_with_calibration(base)], base, "folders with im0.png, im1.png, disp0GT.pfm")
+
+
+def folder(root: str | Path) -> list[Frame]:
+    """Return the pairs of a plain folder: ``left/NAME`` and ``right/NAME``, matched without extension.
+
+    Ground truth, where there is any, lies in ``disp_noc`` and ``disp_occ``; ``disparity`` is another name of
+    the latter, and ``obj_map`` holds object maps. Disparities are 16-bit KITTI PNG, PFM or NPY.
+    """
+    base = _root(root)
+    left, right = _stems(base / "left", _IMAGES), _stems(base / "right", _IMAGES)
+    noc, objects = _stems(base / "disp_noc", _MAPS), _stems(base / "obj_map", _IMAGES)
+    occ = {**_stems(base / "disparity", _MAPS), **_stems(base / "disp_occ", _MAPS)}
+    frames = [
+        Frame(
+            name,
+            left.get(name, base / "left" / f"{name}.png"),
+            right.get(name, base / "right" / f"{name}.png"),
+            noc=_lazy(read_disparity, noc.get(name)),
+            occ=_lazy(read_disparity, occ.get(name)),
+            objects=_lazy(read_image, objects.get(name)),
+        )
+        for name in left.keys() | right.keys() | noc.keys() | occ.keys()
+    ]
+    return _found("plain", frames, base, "left/NAME.png, right/NAME.png, disparity/NAME.png (or .pfm, .npy)")
+
+
+def scenes(count: int = 20) -> list[Frame]:
+    """Return `count` synthetic pairs with exact ground truth; the n-th is always the same.
+
+    Raises
+    ------
+    OptionError
+        If `count` is below 1.
+    """
+    if count < 1:
+        raise OptionError(f"count must be at least 1, got {count}")
+
+    def part(index: int, take: Callable[[Any], NDArray[Any]]) -> Loader:
+        return lambda: take(_scene(index))
+
+    return [
+        Frame(
+            f"scene_{index:03d}",
+            part(index, lambda scene: scene.left),
+            part(index, lambda scene: scene.right),
+            noc=part(index, lambda scene: scene.noc),
+            occ=part(index, lambda scene: scene.occ),
+            objects=part(index, lambda scene: scene.objects),
+            calibration=partial(_scene_calibration, index),
+        )
+        for index in range(count)
+    ]
+
+
+DATASETS: dict[str, Callable[[str | Path], list[Frame]]] = {
+    "kitti2015": kitti2015,
+    "kitti2012": kitti2012,
+    "middlebury": middlebury,
+    "eth3d": eth3d,
+    "folder": folder,
+}
+"""The data sets that live in a folder, by the names that the command line uses."""
+
+
+def load(dataset: str, root: str | Path | None = None, *, count: int = 20) -> list[Frame]:
+    """Return the frames of a data set by its name.
+
+    Parameters
+    ----------
+    dataset : str
+        A key of `DATASETS`, or ``"scenes"``.
+    root : str or Path, optional
+        Its folder; ``scenes`` needs none.
+    count : int
+        Frames to make, for ``scenes``.
+
+    Raises
+    ------
+    UnknownNameError, OptionError, FileError
+        If there is no such data set, `root` is not given, or holds none of its frames.
+    """
+    if dataset == "scenes":
+        return scenes(count)
+    if dataset not in DATASETS:
+        raise UnknownNameError(did_you_mean("data set", dataset, [*DATASETS, "scenes"]))
+    if root is None:
+        raise OptionError(f"root must name the folder of data set {dataset!r}, got none")
+    return DATASETS[dataset](root)
+
+
+@lru_cache(maxsize=2)
+def _scene(index: int) -> Any:
+    """Draw a scene once for its images and maps, which are asked for one after the other."""
+    return import_module("stereokit_evaluation.synthetic.scenes").generate(index, *_SCENE_SIZE)
+
+
+def _scene_calibration(index: int) -> Calibration:
+    scene = _scene(index)
+    focal = float(scene.focal_px)
+    return Calibration(focal, focal, float(scene.cx), float(scene.cy), float(scene.baseline_m))
+
+
+def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth: Sequence[str]) -> list[Frame]:
+    given = _root(root)
+    base = given / "training" if (given / "training").is_dir() else given
+    a, b = next((pair for pair in pairs if (base / pair[0]).is_dir()), pairs[0])
+    noc, occ, objects = (base / part for part in truth)
+    # A frame of which any part is there is listed, so that the parts that are missing are reported.
+    names = {path.stem for part in (base / a, base / b, noc, occ) for path in part.glob("*_10.png")}
+    frames = [
+        Frame(
+            name,
+            base / a / f"{name}.png",
+            base / b / f"{name}.png",
+            noc=_lazy(read_disparity, _existing(noc / f"{name}.png")),
+            occ=_lazy(read_disparity, _existing(occ / f"{name}.png")),
+            objects=_lazy(read_image, _existing(objects / f"{name}.png")),
+            max_disparity=_KITTI_DISPARITIES,
+            calibration=_kitti_calibration(base, name, (2, 3) if a != "image_0" else (0, 1)),
+        )
+        for name in names
+    ]
+    wanted = f"[training/]{a}/*_10.png, {b}/*_10.png, {truth[0]}/*_10.png, {truth[1]}/*_10.png"
+    return _found(title, frames, given, wanted)
+
+
+def _kitti_calibration(base: Path, name: str, cameras: tuple[int, int]) -> Callable[[], Calibration] | None:
+    number = name.partition("_")[0]
+    places = (base / folder / f"{number}.txt" for folder in ("calib_cam_to_cam", "calib"))  # of 2015, of 2012
+    path = next((path for path in places if path.exists()), None)
+    return None if path is None else partial(read_calibration, path, cameras)
+
+
+def _with_calibration(base: Path) -> Iterator[Frame]:
+    """Yield the pairs that are laid out as Middlebury does since 2014, and ETH3D."""
+    for left in _images_below(base):
+        scene = left.parent
+        if left.name != "im0.png" or _sibling(scene, "im2"):  # the scenes of 2001 hold im0 to im8
+            continue
+        truth = next((path for name in ("disp0GT.pfm", "disp0.pfm") if (path := scene / name).exists()), None)
+        occ, mask = _lazy(read_disparity, truth), _existing(scene / "mask0nocc.png")
+        yield Frame(
+            _name(base, scene),
+            left,
+            _sibling(scene, "im1") or scene / "im1.png",
+            noc=None if occ is None or mask is None else partial(_masked, occ, mask),
+            occ=occ,
+            max_disparity=_ndisp(scene / "calib.txt"),
+            calibration=partial(read_calibration, path) if (path := scene / "calib.txt").exists() else None,
+        )
+
+
+def _scaled(base: Path, layout: str, left: Path, right: str, truth: str) -> Frame:
+    """Return a pair whose disparity is an 8-bit image with several levels a pixel."""
+    scene = left.parent
+    found, mask = _sibling(scene, truth), _sibling(scene, "mask_nonocc")
+    levels = _LEVELS[layout]
+    occ = None if found is None else partial(_levels, found, levels, _WIDEST[layout])
+    return Frame(
+        _name(base, scene),
+        left,
+        _sibling(scene, right) or scene / f"{right}{left.suffix}",
+        noc=None if occ is None or mask is None else partial(_masked, occ, mask),
+        occ=occ,
+        max_disparity=-(-256 // levels // 16) * 16,
+    )
+
+
+def _levels(path: Path, levels: int, widest: int) -> NDArray[np.float32]:
+    image = read_image(path, gray=True)
+    if image.dtype != np.uint8:
+        raise FileError(f"{path} must be an 8-bit disparity map, got {image.dtype}")
+    if image.shape[1] > widest:
+        raise FileError(f"{path} must be at most {widest} px wide at {levels} levels a pixel, got {image.shape[1]}")
+    disparity: NDArray[np.float32] = image.astype(np.float32) / np.float32(levels)
+    disparity[image == 0] = np.nan
+    return disparity
+
+
+def _masked(load_map: Loader, mask: Path) -> NDArray[np.float32]:
+    """Keep the disparity where the mask is white: seen by both cameras (grey: hidden from the right)."""
+    disparity, seen = load_map(), read_image(mask, gray=True)
+    if seen.shape != disparity.shape:
+        raise FileError(f"{mask} must have the size of its map, {disparity.shape}, got {seen.shape}")
+    return np.where(seen == 255, disparity, np.float32(np.nan))
+
+
+def _ndisp(path: Path) -> int | None:
+    """Return the number of disparities that a calibration file bounds, None if it does not say."""
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return None
+    values = dict(line.strip().partition("=")[::2] for line in lines)
+    text = values.get("ndisp", "").strip()
+    return int(text) if text.isdecimal() and int(text) > 0 else None
+
+
+def _root(root: str | Path) -> Path:
+    base = Path(root)
+    if not base.is_dir():
+        raise FileError(f"root must be a folder, got {str(base)!r}, which is not")
+    return base
+
+
+def _found(title: str, frames: list[Frame], root: Path, wanted: str) -> list[Frame]:
+    if not frames:
+        raise FileError(f"root holds no {title} frames, got {str(root)!r}; expected {wanted}")
+    return sorted(frames, key=lambda frame: frame.name)
+
+
+def _images_below(base: Path) -> list[Path]:
+    return sorted(path for path in base.rglob("*") if path.suffix.lower() in (".png", ".ppm", ".pgm"))
+
+
+def _name(base: Path, scene: Path) -> str:
+    return scene.relative_to(base).as_posix() if scene != base else scene.resolve().name
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.exists() else None
+
+
+def _sibling(scene: Path, stem: str) -> Path | None:
+    return next((path for end in (".png", ".ppm", ".pgm") if (path := scene / f"{stem}{end}").exists()), None)
+
+
+def _stems(part: Path, endings: tuple[str, ...]) -> dict[str, Path]:
+    return {path.stem: path for path in sorted(part.glob("*")) if path.suffix.lower() in endings}
+
+
+def _lazy(read: Callable[[Path], NDArray[Any]], path: Path | None) -> Loader | None:
+    return None if path is None else partial(read, path)

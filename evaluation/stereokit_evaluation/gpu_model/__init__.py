@@ -1,0 +1,1 @@
+"""Modelled times of kernels on GPUs."""

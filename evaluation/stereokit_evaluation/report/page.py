@@ -1,0 +1,204 @@
+"""Reports as one HTML file that needs no network: charts, tables that sort, and a viewer of disparity maps.
+
+Charts are drawn by Plotly, whose script comes with its Python package and is embedded compressed; the page undoes
+that itself. Template, style and scripts lie in ``assets``.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib import import_module
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereokit.errors import StereokitError
+from stereokit.io import write_bytes
+from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL
+from stereokit_evaluation.data import published
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.report import charts, viewer
+from stereokit_evaluation.scoring.runner import Scored
+from stereokit_evaluation.study.run import Row, Study
+from stereokit_evaluation.study.table import missing_lines
+
+__all__ = ["chosen_frames", "render", "require", "write_report"]
+
+_SCRIPTS = ("maps.js", "cloud.js", "viewer.js", "page.js")
+
+
+def write_report(path: Path, document: dict[str, Any], study: Study, frames: Sequence[Frame], show: int) -> int:
+    """Write the report of a study and return its size in bytes.
+
+    Parameters
+    ----------
+    path : Path
+        An HTML file.
+    document : dict
+        The study's JSON.
+    study : Study
+        Its rows; their matchers make the maps to look at.
+    frames : sequence of Frame
+        Those that were scored.
+    show : int
+        How many of them to show in the viewer, spread from the easiest to the hardest.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    StereokitError
+        If jinja2 or plotly is not installed.
+    """
+    rows = document["results"]
+    title = f"{document['dataset']}{', ' + document['split'] if document['split'] else ''}"
+    drawn = {
+        "chart-e4": charts.bars(rows, "e4", document["dataset"]),
+        "chart-e5": charts.bars(rows, "e5", document["dataset"]),
+        "chart-time": charts.accuracy_time(rows),
+    }
+    page = render(
+        "study.html.j2",
+        [_look(frame, study.rows) for frame in chosen_frames(frames, study.rows, show)],
+        charts=drawn,
+        title=f"Robustness study: {title}",
+        document=document,
+        rows=rows,
+        methods=_first_methods(study.rows),
+        regions=charts.REGIONS,
+        stages=(TOTAL, *GROUPS, OTHER),
+        missing=missing_lines(study.rows),
+        published=published,
+    )
+    write_bytes(path, page)
+    return len(page)
+
+
+def render(
+    template: str, pairs: Sequence[dict[str, Any]], *, charts: dict[str, Any] | None = None, **content: Any
+) -> bytes:
+    """Return a page.
+
+    Parameters
+    ----------
+    template : str
+        A file of ``assets``.
+    pairs : sequence of dict
+        What `stereokit_evaluation.report.viewer.pair` returns, for the viewer.
+    charts : dict, optional
+        Plotly figures by the id of the element that they go to; without them the page has no Plotly.
+    **content
+        What the template asks for.
+
+    Raises
+    ------
+    StereokitError
+        If jinja2 or plotly is not installed.
+    """
+    jinja2 = require("jinja2")
+    markup = require("markupsafe").Markup
+    folder = files("stereokit_evaluation.report") / "assets"
+    names = (*_SCRIPTS, *(("charts.js",) if charts else ()))
+    texts = {name: (folder / name).read_text(encoding="utf-8") for name in (*names, "style.css")}
+    loader = jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8"))
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters["json"] = lambda value: markup(_json(value))
+    environment.filters["figure"] = lambda value, digits=2: "\u2013" if value is None else f"{value:.{digits}f}"
+    text: str = environment.get_template(template).render(
+        pairs=pairs,
+        constants=viewer.constants(),
+        charts=charts or {},
+        plotly=_plotly() if charts else "",
+        style=texts.pop("style.css"),
+        scripts=[texts[name] for name in names],
+        **content,
+    )
+    return text.encode()
+
+
+def chosen_frames(frames: Sequence[Frame], rows: Sequence[Row], show: int) -> list[Frame]:
+    """Return `show` of the frames, evenly spaced in difficulty from the easiest to the hardest.
+
+    Difficulty is the D1 error pooled over all our rows.
+    """
+    outliers: dict[str, list[int]] = {}
+    for row in rows:
+        for scored in row.result.frames:
+            counts = scored.score.main.filled
+            total = outliers.setdefault(scored.name, [0, 0])
+            total[0] += counts.outliers
+            total[1] += counts.pixels
+    ranked = sorted(frames, key=lambda frame: _share(outliers.get(frame.name, [0, 0])))
+    if show >= len(ranked):
+        return ranked
+    places = np.linspace(0, len(ranked) - 1, show) if show > 1 else [len(ranked) // 2][:show]
+    return [ranked[round(float(place))] for place in places]
+
+
+def _first_methods(rows: Sequence[Row]) -> list[str]:
+    """Return the two methods that the viewer starts with: the best by D1, against one of the same matcher."""
+    scored = [row for row in rows if row.missing is None and row.result.frames]
+    best = min(scored, key=lambda row: row.result.score.main.filled.d1() or 0.0)
+    others = sorted((row for row in scored if row is not best), key=lambda row: _label(row) != _label(best))
+    return [row.configuration.name for row in (best, *others, best)[:2]]
+
+
+def _label(row: Row) -> str:
+    return row.configuration.label
+
+
+def _share(counts: Sequence[int]) -> float:
+    return counts[0] / counts[1] if counts[1] else 0.0
+
+
+def _look(frame: Frame, rows: Sequence[Row]) -> dict[str, Any]:
+    """Match a frame once more with every configuration, for the viewer."""
+    left, right = frame.load_left(gray=True), frame.load_right(gray=True)
+    maps = []
+    for row in rows:
+        scored = next((one for one in row.result.frames if one.name == frame.name), None)
+        if row.configuration.matcher is not None and scored is not None:
+            found = row.configuration.matcher(left, right)
+            disparity, valid = np.asarray(found.disparity), np.asarray(found.valid)
+            maps.append(viewer.Shown(row.configuration.name, disparity, valid, _note(scored)))
+    return viewer.pair(
+        frame.name,
+        frame.load_left(),
+        maps,
+        noc=frame.load_noc(),
+        occ=frame.load_occ(),
+        calibration=frame.load_calibration(),
+    )
+
+
+def _note(scored: Scored) -> str:
+    d1 = scored.score.main.filled.d1()
+    return "" if d1 is None else f"D1 {d1:.2f} %"
+
+
+def _json(value: Any) -> str:
+    """Return JSON that may stand inside a script element."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+@lru_cache(maxsize=1)
+def _plotly() -> str:
+    script: str = require("plotly.offline").get_plotlyjs()
+    return base64.b64encode(gzip.compress(script.encode(), 9, mtime=0)).decode()
+
+
+def require(module: str) -> Any:
+    """Import a package of the extra ``report``, or raise StereokitError with the way to get it."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise StereokitError(f'a report needs {module.partition(".")[0]}: pip install "stereokit[report]"') from error

@@ -1,0 +1,135 @@
+"""What the viewer of the reports shows of one stereo pair: the left image, maps, truth, geometry.
+
+The page draws pictures, errors and points itself from the maps (`stereokit_evaluation.report.packing`), so that
+hovering reads numbers and a method more costs one map.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.calibration import Calibration
+from stereokit.errors import InputError
+from stereokit.result import colorize
+from stereokit_evaluation.report.packing import pack_map, pack_mask
+from stereokit_evaluation.scoring.error_map import COLOURS, EDGES
+from stereokit_evaluation.scoring.kitti import D1_PIXELS, D1_SHARE, fill_background
+
+__all__ = ["Shown", "constants", "pair"]
+
+_JPEG_QUALITY = 85
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One map to look at.
+
+    Attributes
+    ----------
+    name : str
+        What the viewer calls it.
+    disparity : (H, W) float32
+        Pixels, NaN where unknown.
+    valid : (H, W) bool
+        Where it was measured.
+    note : str
+        A few words beside the name, such as its error on this pair.
+    """
+
+    name: str
+    disparity: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    note: str = ""
+
+
+def constants() -> dict[str, Any]:
+    """Return what the page needs to draw any pair: Turbo's colours, and the colours and the rule of errors."""
+    ramp = np.linspace(0.0, 1.0, 256, dtype=np.float32)[None]
+    return {
+        "turbo": colorize(ramp, 0.0, 1.0)[0].tolist(),
+        "error": {"colours": COLOURS, "edges": EDGES, "pixels": D1_PIXELS, "share": D1_SHARE},
+    }
+
+
+def pair(
+    name: str,
+    left: NDArray[Any],
+    maps: Sequence[Shown],
+    *,
+    noc: NDArray[np.float32] | None = None,
+    occ: NDArray[np.float32] | None = None,
+    calibration: Calibration | None = None,
+) -> dict[str, Any]:
+    """Return a pair as the page's JSON has it.
+
+    Parameters
+    ----------
+    name : str
+    left : (H, W) or (H, W, 3), uint8, uint16 or float
+        The left image.
+    maps : sequence of Shown
+        At least one, as large as `left`. Where one has no value it is filled as for scoring, and marked as not
+        measured.
+    noc, occ : (H, W) float32, optional
+        True disparity of the pixels that both cameras see, and of all pixels; NaN unknown.
+    calibration : Calibration, optional
+        For depth; None leaves it out.
+
+    Raises
+    ------
+    InputError
+        If there is no map, or one has another size.
+    """
+    if not maps:
+        raise InputError("maps must hold at least one map, got none")
+    height, width = left.shape[:2]
+    for label, array in (("noc", noc), ("occ", occ), *((shown.name, shown.disparity) for shown in maps)):
+        if array is not None and array.shape != (height, width):
+            raise InputError(f"{label} must have the size of the left image, {(height, width)}, got {array.shape}")
+    truth = noc if occ is None else occ
+    reference = maps[0].disparity if truth is None else truth
+    known = reference[np.isfinite(reference)]
+    return {
+        "name": name,
+        "width": width,
+        "height": height,
+        "left": _jpeg(left),
+        "top": max(1.0, float(np.percentile(known, 99))) if known.size else 1.0,
+        "truth": None if truth is None else pack_map(truth),
+        "seen": None if noc is None or occ is None else pack_mask(np.isfinite(noc)),
+        "calibration": None if calibration is None else _geometry(calibration, width, height),
+        "maps": [_packed(shown) for shown in maps],
+    }
+
+
+def _packed(shown: Shown) -> dict[str, Any]:
+    known = np.isfinite(shown.disparity)
+    # Filling for scoring takes negative values for unknown, so only maps with gaps go through it.
+    filled = shown.disparity if known.all() else fill_background(shown.disparity)
+    measured = pack_mask(known & shown.valid)
+    return {"name": shown.name, "note": shown.note, "measured": measured, "map": pack_map(filled)}
+
+
+def _geometry(calibration: Calibration, width: int, height: int) -> dict[str, float]:
+    calibration.check_size(width, height)
+    names = ("fx", "fy", "cx0", "cy", "baseline_m", "doffs")
+    return {name: float(getattr(calibration, name)) for name in names}
+
+
+def _jpeg(image: NDArray[Any]) -> str:
+    """Return an image as a data URI; 16-bit and float ones are scaled to 8 bits by their range."""
+    if image.dtype != np.uint8:
+        top = 65535.0 if image.dtype == np.uint16 else max(float(np.nanmax(np.abs(image), initial=0.0)), 1e-9)
+        image = np.rint(np.clip(np.nan_to_num(image / top), 0, 1) * 255).astype(np.uint8)
+    stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
+    done, data = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if not done:
+        raise InputError(f"left cannot be written as JPEG, got shape {image.shape}")
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

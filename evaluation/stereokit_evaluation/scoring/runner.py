@@ -1,0 +1,236 @@
+"""Run a matcher, or read finished maps, over frames and score each: the loop of `evaluate`.
+
+A frame that cannot be read or scored becomes a `Skipped` and the loop goes on. Only the call of the matcher
+is timed, after one untimed call on the first pair that loads.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import FileError, InputError, StereokitError
+from stereokit.io import read_disparity
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.scoring.kitti import Score, score
+
+__all__ = [
+    "Estimate",
+    "Estimator",
+    "Matching",
+    "Result",
+    "Scored",
+    "Skipped",
+    "from_files",
+    "run",
+    "score_frames",
+    "seen_in_training",
+    "with_matcher",
+]
+
+
+class _Disparity(Protocol):
+    @property
+    def disparity(self) -> Any: ...
+    @property
+    def valid(self) -> Any: ...
+
+
+Matching = Callable[[NDArray[Any], NDArray[Any]], _Disparity]
+"""What `run` calls with a left and a right image: `stereokit.Matcher`, or anything with its result."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A disparity map to score, (H, W) float32; where it was measured; and the seconds that it took."""
+
+    disparity: NDArray[np.float32]
+    measured: NDArray[np.bool_] | None = None
+    seconds: float | None = None
+
+
+Estimator = Callable[[Frame], Estimate]
+Observer = Callable[[Frame, Estimate, NDArray[np.float32] | None, NDArray[np.float32] | None], None]
+
+
+@dataclass(frozen=True)
+class Scored:
+    """One frame's counts, and the seconds that its matching took, if any was run."""
+
+    name: str
+    score: Score
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A frame that could not be scored, and why, in one line."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """All frames of one run.
+
+    Parameters
+    ----------
+    frames : tuple of Scored
+        In the order of the run.
+    skipped : tuple of Skipped
+        Those that could not be scored; they count nowhere.
+    """
+
+    frames: tuple[Scored, ...] = ()
+    skipped: tuple[Skipped, ...] = ()
+    score: Score = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "score", sum((frame.score for frame in self.frames), Score()))
+
+    @property
+    def seconds_per_image(self) -> float | None:
+        """Mean seconds of the matcher's calls, None where none was timed."""
+        timed = [frame.seconds for frame in self.frames if frame.seconds is not None]
+        return sum(timed) / len(timed) if timed else None
+
+
+def run(
+    frames: Iterable[Frame],
+    matcher: Matching,
+    progress: Callable[[int, int, str], None] | None = None,
+    *,
+    gray: bool = True,
+) -> Result:
+    """Match and score frames, and pool the counts.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+    matcher : callable
+        A `stereokit.Matcher`, or any function of two images that returns an object with ``disparity`` and
+        ``valid``.
+    progress : callable, optional
+        Called after each frame with the number done, the number of all, and the frame's name.
+    gray : bool
+        Give the matcher grey images (the default, as all published figures) rather than what the files hold.
+
+    Returns
+    -------
+    Result
+        ``result.score.noc.all.filled.d1()`` is the pooled D1 error over non-occluded pixels.
+    """
+    every = list(frames)
+    scored: list[Scored] = []
+    skipped: list[Skipped] = []
+    for done, outcome in enumerate(score_frames(every, with_matcher(matcher, gray=gray)), start=1):
+        if isinstance(outcome, Scored):
+            scored.append(outcome)
+        else:
+            skipped.append(outcome)
+        if progress is not None:
+            progress(done, len(every), outcome.name)
+    return Result(tuple(scored), tuple(skipped))
+
+
+def score_frames(
+    frames: Iterable[Frame],
+    estimate: Estimator,
+    observe: Observer | None = None,
+) -> Iterator[Scored | Skipped]:
+    """Yield the outcome of each frame, one at a time, so that an interrupted run keeps what it has.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+    estimate : callable
+        Turns a frame into an `Estimate`: `with_matcher` or `from_files`.
+    observe : callable, optional
+        Called for each scored frame with the frame, its estimate, and its *noc* and *occ* ground truth.
+    """
+    for frame in frames:
+        try:
+            noc, occ, objects = frame.load_noc(), frame.load_occ(), frame.load_objects()
+            if noc is None and occ is None:
+                raise FileError("no ground truth found")
+            found = estimate(frame)
+            result = score(found.disparity, noc=noc, occ=occ, objects=objects, measured=found.measured)
+        except (StereokitError, OSError) as error:
+            yield Skipped(frame.name, " ".join(str(error).split()))
+            continue
+        if observe is not None:
+            observe(frame, found, noc, occ)
+        yield Scored(frame.name, result, found.seconds)
+
+
+def seen_in_training(matcher: object, dataset: str, frames: Iterable[Frame]) -> str | None:
+    """Return a line that says how many of the frames a matcher's refiner was trained on, None if on none.
+
+    Parameters
+    ----------
+    matcher : object
+        A `stereokit.Matcher`, whose refiner may tell what it was ``trained_on``.
+    dataset : str
+        Name of the data set that the frames are of.
+    frames : iterable of Frame
+    """
+    refiner = getattr(matcher, "_refine", None)
+    known: frozenset[str] = getattr(refiner, "trained_on", frozenset())
+    every = list(frames)
+    seen = sum(f"{dataset}/{frame.name}" in known for frame in every)
+    if not seen:
+        return None
+    name = getattr(matcher, "refiner", None)
+    return f"refiner {name!r} was trained on {seen} of these {len(every)} frames: on those its errors say little"
+
+
+def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:
+    """Return an estimator that loads a pair and times `matcher` on it, after one call to warm up."""
+    warm = False
+
+    def estimate(frame: Frame) -> Estimate:
+        nonlocal warm
+        left, right = frame.load_left(gray=gray), frame.load_right(gray=gray)
+        if left.shape != right.shape:
+            raise InputError(f"left and right must have one size, got {left.shape} and {right.shape}")
+        if not warm:
+            matcher(left, right)
+            warm = True
+        start = time.perf_counter()
+        found = matcher(left, right)
+        seconds = time.perf_counter() - start
+        return Estimate(np.asarray(found.disparity), np.asarray(found.valid), seconds)
+
+    return estimate
+
+
+def from_files(directory: str | Path) -> Estimator:
+    """Return an estimator that reads ``NAME.png`` (16-bit KITTI, 0 unknown), ``NAME.pfm`` or ``NAME.npy``.
+
+    For a name with folders, such as ``2003/cones``, the last part alone will do. All unknown pixels count as
+    not measured, and are filled before scoring.
+
+    Raises
+    ------
+    FileError
+        If `directory` is no folder; and for each frame that has no map in it.
+    """
+    base = Path(directory)
+    if not base.is_dir():
+        raise FileError(f"predictions must be a folder, got {str(base)!r}, which is not")
+
+    def estimate(frame: Frame) -> Estimate:
+        for name in (frame.name, frame.name.rpartition("/")[2]):
+            for ending in (".png", ".pfm", ".npy"):
+                if (path := base / f"{name}{ending}").exists():
+                    return Estimate(read_disparity(path))
+        raise FileError(f"no map {frame.name}.png, .pfm or .npy in {base}")
+
+    return estimate

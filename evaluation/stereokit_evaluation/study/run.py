@@ -1,0 +1,289 @@
+"""The loop of the study: every frame through every configuration, timed, scored and kept.
+
+Frames are the outer loop: a pair is loaded once, all configurations take turns on it (so that a busy machine harms
+all alike), and an interrupt leaves the same frames for all. Each configuration is called once to warm up; on each
+frame it is then called `repeats` times, and the median counts.
+
+A frame that one configuration cannot do is left out for all: the figures of the rows stay comparable.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import FileError, InputError, StereokitError
+from stereokit_evaluation.data import datasets
+from stereokit_evaluation.data import frame as frames
+from stereokit_evaluation.scoring import kitti
+from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, Watch, watched
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.study.configurations import PEER, Configuration, describe_error, fingerprint, title
+from stereokit_evaluation.scoring.kitti import score
+from stereokit_evaluation.scoring.runner import Result, Scored, Skipped
+from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
+
+__all__ = ["Row", "Study", "measure", "run_study"]
+
+Clock = Callable[[], float]
+
+_HOPELESS = 3  # frames that a configuration fails on, before any that it can do, until it is given up
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One configuration's results.
+
+    Attributes
+    ----------
+    configuration : Configuration
+    result : Result
+        Over the frames that all configurations scored; empty if it is missing.
+    ms : dict of str to float
+        Milliseconds a frame, in all and by group of stages: medians over the frames of `result`.
+    missing : str or None
+        Why there are no results.
+    """
+
+    configuration: Configuration
+    result: Result
+    ms: dict[str, float]
+    missing: str | None = None
+
+
+@dataclass
+class Study:
+    """All that a run found.
+
+    Attributes
+    ----------
+    rows : list of Row
+        In the order of the configurations.
+    skipped : list of Skipped
+        Frames that count nowhere, each once, with the first reason.
+    reused, computed : int
+        Records that were read from the store, and that were made.
+    interrupted : bool
+        Whether the user ended it.
+    """
+
+    rows: list[Row] = field(default_factory=list)
+    skipped: list[Skipped] = field(default_factory=list)
+    reused: int = 0
+    computed: int = 0
+    interrupted: bool = False
+
+
+class _Loaded:
+    """A frame's images and ground truth, read when first asked for and once."""
+
+    def __init__(self, frame: Frame, gray: bool) -> None:
+        self.frame = frame
+        self.gray = gray
+
+    @cached_property
+    def images(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        left, right = self.frame.load_left(gray=self.gray), self.frame.load_right(gray=self.gray)
+        if left.shape != right.shape:
+            raise InputError(f"left and right must have one size, got {left.shape} and {right.shape}")
+        return left, right
+
+    @cached_property
+    def truth(self) -> dict[str, NDArray[Any] | None]:
+        maps = {name: getattr(self.frame, f"load_{name}")() for name in ("noc", "occ", "objects")}
+        size = self.images[0].shape[:2]
+        for name, values in maps.items():
+            if values is not None and values.shape != size:
+                raise InputError(f"{name} must have the size of the images, {size}, got {values.shape}")
+        return maps
+
+    @cached_property
+    def digest(self) -> str:
+        if self.frame.noc is None and self.frame.occ is None:
+            raise FileError("no ground truth found")
+        return frame_digest(self.frame)
+
+
+def run_study(
+    every: Iterable[Frame],
+    configurations: Sequence[Configuration],
+    store: Store,
+    *,
+    repeats: int = 3,
+    gray: bool = True,
+    about_times: Any = None,
+    step: Callable[[str, int], None] = lambda text, advance: None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> Study:
+    """Measure and score all configurations on all frames, but for what the store has.
+
+    Parameters
+    ----------
+    every : iterable of Frame
+    configurations : sequence of Configuration
+        Those without a matcher are reported as missing.
+    store : Store
+    repeats : int
+        Timed calls for each frame and configuration, 1 or more.
+    gray : bool
+        Give grey images.
+    about_times : any
+        What times depend on beside the configuration: threads, processor.
+    step : callable
+        Called with a few words and the number of steps taken, before each configuration of each frame.
+    tell : callable
+        Called with one line for each frame that is left out.
+
+    Returns
+    -------
+    Study
+        An interrupt (KeyboardInterrupt) ends the work and keeps what was done.
+
+    Raises
+    ------
+    FileError
+        If the store cannot be written to.
+    """
+    study = Study()
+    missing = {index: c.missing or "" for index, c in enumerate(configurations) if c.matcher is None}
+    done: dict[int, dict[str, Record]] = {index: {} for index in range(len(configurations)) if index not in missing}
+    failed: dict[str, list[tuple[int | None, str]]] = {}
+    warm: set[int] = set()
+
+    def fail(frame: Frame, index: int | None, reason: str) -> None:
+        tell(f"skipped {frame.name}: {_named(configurations, index, reason)}")
+        failed.setdefault(frame.name, []).append((index, reason))
+        if index is not None and not done[index] and _times_failed(failed, index) == _HOPELESS:
+            missing[index] = reason  # and its frames count again
+
+    common = [_source(), repeats, gray, about_times]
+    try:
+        for frame in every:
+            loaded = _Loaded(frame, gray)
+            step(frame.name, sum(index in missing for index in range(len(configurations))))
+            for index, configuration in enumerate(configurations):
+                if index in missing:
+                    continue
+                step(f"{frame.name}: {configuration.name}", 1)
+                place = f"{configuration.label}/{title(configuration.setting)}/{frame.name}"
+                try:
+                    key = digest([loaded.digest, configuration.identity, *common])
+                    record = store.get(place, key)
+                    if record is None:
+                        _ = loaded.images, loaded.truth  # here, because trouble with these is the frame's
+                except (StereokitError, OSError) as error:
+                    fail(frame, None, describe_error(error))
+                    break
+                if record is None:
+                    try:
+                        record = measure(configuration, loaded, repeats, warm=index in warm)
+                    except ImportError as error:  # a refiner's runtime, asked for at its first call
+                        missing[index] = describe_error(error)
+                        continue
+                    except Exception as error:  # a plug-in's slip must not end a long run
+                        fail(frame, index, describe_error(error))
+                        continue
+                    warm.add(index)
+                    store.put(place, key, record, {"frame": frame.name, "identity": configuration.identity})
+                    study.computed += 1
+                else:
+                    study.reused += 1
+                done[index][frame.name] = record
+    except KeyboardInterrupt:
+        study.interrupted = True
+    _pool(study, configurations, done, missing, failed)
+    return study
+
+
+def measure(
+    configuration: Configuration, loaded: Any, repeats: int, *, warm: bool = True, clock: Clock = time.perf_counter
+) -> Record:
+    """Return the score and the median times of one configuration on one frame.
+
+    Parameters
+    ----------
+    configuration : Configuration
+        With a matcher.
+    loaded : object
+        With ``images`` and ``truth``.
+    repeats : int
+        Timed calls.
+    warm : bool
+        Whether the matcher was called before; if not, it is, untimed.
+    clock : callable
+        Returns seconds.
+    """
+    matcher = configuration.matcher
+    assert matcher is not None
+    left, right = loaded.images
+    truth = loaded.truth
+    if not warm:
+        matcher(left, right)
+    runs: list[dict[str, float]] = []
+    for _ in range(repeats):
+        watch = Watch(clock)
+        if configuration.setting == PEER:
+            begun = clock()
+            found = matcher(left, right)
+            runs.append({TOTAL: clock() - begun})
+            continue
+        with watched(matcher, watch, groups=True):
+            begun = clock()
+            found = matcher(left, right)
+            total = clock() - begun
+        known = {group: watch.seconds.get(group, 0.0) for group in GROUPS}
+        runs.append({TOTAL: total, **known, OTHER: total - sum(known.values())})
+    counts = score(np.asarray(found.disparity), **truth, measured=np.asarray(found.valid))
+    return Record(counts, {name: 1e3 * median(run[name] for run in runs) for name in runs[0]})
+
+
+def _named(configurations: Sequence[Configuration], index: int | None, reason: str) -> str:
+    return reason if index is None else f"{configurations[index].name}: {reason}"
+
+
+def _times_failed(failed: dict[str, list[tuple[int | None, str]]], index: int) -> int:
+    return sum(cause == index for causes in failed.values() for cause, _ in causes)
+
+
+def _source() -> list[str]:
+    """Return what scores and times depend on in this package."""
+    modules = (datasets.__file__, frames.__file__, kitti.__file__, __file__)
+    return [fingerprint(Path(str(file))) for file in modules]
+
+
+def _pool(
+    study: Study,
+    configurations: Sequence[Configuration],
+    done: dict[int, dict[str, Record]],
+    missing: dict[int, str],
+    failed: dict[str, list[tuple[int | None, str]]],
+) -> None:
+    """Build the rows over the frames that all configurations scored; one that scored none is missing."""
+    some = {name for records in done.values() for name in records}
+    for index, records in done.items():
+        if index not in missing and not records and some:
+            reasons = [reason for causes in failed.values() for cause, reason in causes if cause == index]
+            missing[index] = reasons[0] if reasons else "interrupted before its first frame"
+    present = [records for index, records in done.items() if index not in missing]
+    shared = [name for name in (present[0] if present else ()) if all(name in records for records in present)]
+    for name, causes in failed.items():
+        told = [_named(configurations, cause, reason) for cause, reason in causes if cause not in missing]
+        if told:
+            study.skipped.append(Skipped(name, told[0]))
+    for index, configuration in enumerate(configurations):
+        if index in missing:
+            study.rows.append(Row(configuration, Result(), {}, missing[index]))
+            continue
+        records = {name: done[index][name] for name in shared}
+        scored = tuple(Scored(name, r.score, r.ms[TOTAL] / 1e3) for name, r in records.items())
+        names = list(next(iter(records.values())).ms) if records else []
+        ms = {name: median(record.ms[name] for record in records.values()) for name in names}
+        study.rows.append(Row(configuration, Result(scored), ms))

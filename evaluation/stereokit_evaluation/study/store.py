@@ -1,0 +1,152 @@
+"""Results of the study on disk, one small file for each frame and configuration: a run goes on where it ended.
+
+A result is filed under a digest of all that it depends on: the content of the images and of the ground truth, the
+resolved options of the matcher, the refiner's weights, the source of the packages, and what its times depend on
+(threads, repeats, processor). So nothing stale is ever read, a changed option recomputes only the configurations
+that it touches, and going back to earlier options costs nothing. Files are written whole or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereokit.errors import FileError
+from stereokit.io import write_bytes
+from stereokit_evaluation.common.folders import make_folder
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.scoring.kitti import Counts, Regions, Score, Tally
+
+__all__ = ["Record", "Store", "digest", "frame_digest"]
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is kept of one configuration on one frame.
+
+    Attributes
+    ----------
+    score : Score
+        The counts.
+    ms : dict of str to float
+        Median milliseconds: ``"total"`` and, where known, by group of stages.
+    """
+
+    score: Score
+    ms: dict[str, float]
+
+
+class Store:
+    """A folder of records; with None it keeps nothing.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Made when first written to.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+
+    def get(self, path: str, key: str) -> Record | None:
+        """Return the record filed under `path` and `key`, None if there is none that can be read.
+
+        Parameters
+        ----------
+        path : str
+            For people: matcher, setting and frame, such as ``"S4/original/000000_10"``.
+        key : str
+            The digest of what the record depends on.
+        """
+        if self.folder is None:
+            return None
+        try:
+            content = json.loads(self._file(path, key).read_bytes())
+            return Record(_score(content["score"]), {str(k): float(v) for k, v in content["ms"].items()})
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
+
+    def put(self, path: str, key: str, record: Record, about: Mapping[str, Any]) -> None:
+        """Write a record, and with it `about`, which says what the key stands for.
+
+        Raises
+        ------
+        FileError
+            If the folder cannot be written to.
+        """
+        if self.folder is None:
+            return
+        file = self._file(path, key)
+        make_folder(file.parent)
+        content = {"score": asdict(record.score), "ms": record.ms, "key": key, "about": about}
+        write_bytes(file, json.dumps(content, default=str).encode())
+
+    def _file(self, path: str, key: str) -> Path:
+        assert self.folder is not None
+        *parts, frame = path.split("/", 2)
+        safe = [re.sub(r"[^A-Za-z0-9+_.@-]", "_", part).lstrip(".") for part in (*parts, frame)]
+        return Path(self.folder, *safe[:-1], f"{safe[-1]}-{key[:20]}.json")
+
+
+def digest(content: Any) -> str:
+    """Return the SHA-256 of anything that JSON can say, as hexadecimal digits."""
+    text = json.dumps([_FORMAT, content], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def frame_digest(frame: Frame) -> str:
+    """Return the SHA-256 of a frame's content: its images and its ground truth.
+
+    Files are read as they are, without decoding; what a function makes is made and read.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read.
+    """
+    found = hashlib.sha256()
+    for name in ("left", "right", "noc", "occ", "objects"):
+        found.update(f"\\0{name}\\0".encode())
+        _feed(found, getattr(frame, name))
+    return found.hexdigest()
+
+
+def _feed(found: Any, source: Any) -> None:
+    """Add a source's content: a file's bytes, the parts of a partial function, an array."""
+    if isinstance(source, Path):
+        try:
+            found.update(hashlib.sha256(source.read_bytes()).digest())
+        except FileNotFoundError as error:
+            raise FileError(f"no such file: {str(source)!r}") from error
+        except OSError as error:
+            raise FileError(f"cannot read {str(source)!r}: {error.strerror or error}") from error
+    elif isinstance(source, partial):
+        found.update(source.func.__qualname__.encode())
+        for part in (*source.args, *source.keywords.values()):
+            _feed(found, part)
+    elif callable(source):
+        array = np.ascontiguousarray(source())
+        found.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    else:
+        found.update(repr(source).encode())
+
+
+def _score(content: Mapping[str, Any]) -> Score:
+    def tally(part: Mapping[str, Any]) -> Tally:
+        bad = tuple(int(count) for count in part["bad"])
+        return Tally(int(part["pixels"]), int(part["outliers"]), bad, float(part["error_sum"]))
+
+    def regions(part: Mapping[str, Any]) -> Regions:
+        return Regions(**{n: Counts(tally(part[n]["filled"]), tally(part[n]["measured"])) for n in ("all", "bg", "fg")})
+
+    return Score(regions(content["noc"]), regions(content["occ"]))

@@ -1,0 +1,132 @@
+"""The study's results as tables on the terminal and as JSON, the paper's published figures beside ours."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from stereokit_evaluation.data import published
+from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL
+from stereokit_evaluation.scoring.summary import figures
+from stereokit_evaluation.study.configurations import PEER, title
+from stereokit_evaluation.study.run import Row, Study
+
+__all__ = ["as_json", "missing_lines", "print_tables", "published_beside"]
+
+_D1 = [(region, part) for region in ("noc", "occ") for part in ("all", "bg", "fg")]
+_WIDTH = 130
+
+
+def published_beside(row: Row) -> dict[str, float | None]:
+    """Return the paper's figures for one row: percent by fig. e4 and e5, milliseconds by table II."""
+    label, setting = row.configuration.label, row.configuration.setting
+    return {
+        "validation_d1": published.VALIDATION.get(label, {}).get(setting),
+        "test_d1_noc": published.TEST.get(label, {}).get(setting),
+        "agx_ms": published.agx_ms(label, setting),
+    }
+
+
+def as_json(study: Study) -> dict[str, Any]:
+    """Return all rows, with what is published beside them; figures are None where nothing was scored."""
+    return {
+        "results": [
+            {
+                "matcher": row.configuration.label,
+                "setting": title(row.configuration.setting) if row.configuration.setting != PEER else PEER,
+                "method": row.configuration.method,
+                "scale": row.configuration.scale,
+                "refiner": None if row.configuration.setting in ("original", PEER) else row.configuration.setting,
+                "device": str(getattr(row.configuration.matcher, "device", "cpu")),
+                "missing": row.missing,
+                **figures(row.result),
+                "ms": row.ms,
+                "published": published_beside(row),
+            }
+            for row in study.rows
+        ],
+        "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in study.skipped],
+        "interrupted": study.interrupted,
+        "records": {"reused": study.reused, "computed": study.computed},
+    }
+
+
+def missing_lines(rows: Sequence[Row]) -> list[str]:
+    """Return one line for each setting that is missing, and why."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        if row.missing is not None:
+            setting = row.configuration.setting
+            found.setdefault((setting, row.missing), []).append(row.configuration.label)
+    return [
+        f"missing: {', '.join(labels)}{'' if setting == PEER else ' ' + title(setting)}: {reason}"
+        for (setting, reason), labels in found.items()
+    ]
+
+
+def print_tables(heading: str, study: Study, note: str) -> None:
+    """Print accuracy, then times, then what is missing."""
+    console = Console(width=None if sys.stdout.isatty() else _WIDTH)
+    console.print(_accuracy(heading, study.rows))
+    console.print(_times(study.rows))
+    for line in (*missing_lines(study.rows), note):
+        console.print(line, markup=False, highlight=False)
+
+
+def _accuracy(heading: str, rows: Sequence[Row]) -> Table:
+    table = _table(f"{heading}: D1 in percent, EPE in pixels")
+    heads = (*(f"{region} {part}" for region, part in _D1), "density", "EPE", "published e4", "published e5, noc")
+    for head in heads:
+        table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
+    for index, row in enumerate(rows):
+        found = figures(row.result)
+        beside = published_beside(row)
+        cells = [found["d1"][region][part] for region, part in _D1]
+        table.add_row(
+            *_names(row),
+            *(_figure(cell) for cell in cells),
+            _figure(found["density"], 1),
+            _figure(found["epe"]),
+            _figure(beside["validation_d1"]),
+            _figure(beside["test_d1_noc"]),
+            end_section=_ends(rows, index),
+        )
+    return table
+
+
+def _times(rows: Sequence[Row]) -> Table:
+    table = _table("milliseconds a frame: medians, after a call to warm up")
+    for head in (TOTAL, *GROUPS, OTHER, "published, AGX Xavier"):
+        table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
+    for index, row in enumerate(rows):
+        cells = (row.ms.get(name) for name in (TOTAL, *GROUPS, OTHER))
+        beside = published_beside(row)["agx_ms"]
+        table.add_row(
+            *_names(row), *(_figure(cell, 1) for cell in cells), _figure(beside), end_section=_ends(rows, index)
+        )
+    return table
+
+
+def _table(heading: str) -> Table:
+    table = Table(title=heading, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    table.add_column("matcher", no_wrap=True)
+    table.add_column("setting", no_wrap=True)
+    return table
+
+
+def _names(row: Row) -> tuple[str, str]:
+    setting = "" if row.configuration.setting == PEER else title(row.configuration.setting)
+    return row.configuration.label, setting if row.missing is None else f"{setting} (missing)".strip()
+
+
+def _ends(rows: Sequence[Row], index: int) -> bool:
+    return index + 1 < len(rows) and rows[index + 1].configuration.label != rows[index].configuration.label
+
+
+def _figure(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

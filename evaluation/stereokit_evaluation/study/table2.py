@@ -1,0 +1,221 @@
+"""Table II of the StereoVAE paper on this machine: the matcher alone, and half-size matching with each refiner.
+
+All take turns, round by round, on one pair, beside OpenCV's modes; the published times are those of the paper's
+Jetson boards. A refiner that is not there is listed with the reason.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any
+
+from rich.console import Console
+
+from stereokit_evaluation.bench.peers import HH, PEERS, THREE_WAY, Call, opencv_threads
+from stereokit_evaluation.bench.stages import GROUPS, Watch, watched
+from stereokit_evaluation.bench.table import format_ms, new_table
+from stereokit_evaluation.bench.timing import Spread, round_robin, spread
+from stereokit_evaluation.common.sizes import Size
+from stereokit_evaluation.data import published
+from stereokit_evaluation.scoring.runner import Matching
+from stereokit_evaluation.study.configurations import Configuration, build, describe_error, settings_at_hand
+from stereokit_refiners.learned import BACKENDS, PRECISIONS
+
+__all__ = ["PipelineRow", "as_json", "print_pipeline", "time_pipeline"]
+
+_PRINTED = {"original": "ZNCC+SGM", "cnn": "Non-VAE NN", "stereovae": "StereoVAE"}
+
+
+@dataclass
+class PipelineRow:
+    """One row of the table.
+
+    Attributes
+    ----------
+    name : str
+        What was timed.
+    size : str
+        Name of the size.
+    threads : int
+    seconds : list of float
+        Of each run.
+    parts : dict of lists of float
+        Of these, what each group of stages took (`stereokit_evaluation.bench.stages.GROUPS`).
+    missing : str or None
+        Why it was not timed.
+    printed : str or None
+        The row of the paper's table II that stands beside it.
+    """
+
+    name: str
+    size: str
+    threads: int
+    seconds: list[float] = field(default_factory=list)
+    parts: dict[str, list[float]] = field(default_factory=dict)
+    missing: str | None = None
+    printed: str | None = None
+
+    @property
+    def spread(self) -> Spread | None:
+        """Median and quartiles in milliseconds, None if it was not timed."""
+        return spread([1e3 * s for s in self.seconds]) if self.seconds else None
+
+    def part_ms(self, group: str) -> float | None:
+        """Return the median milliseconds of a group of stages, None where there is none."""
+        times = self.parts.get(group, [])
+        return 1e3 * median(times) if any(times) else None
+
+
+def time_pipeline(
+    size: Size,
+    threads: int,
+    methods: Sequence[str],
+    images: tuple[Any, Any],
+    rounds: int,
+    rows: list[PipelineRow],
+    *,
+    with_peers: bool = True,
+    runtimes: str | None = None,
+    step: Callable[[str], None] = lambda text: None,
+) -> None:
+    """Time the rows of one size and number of threads; they are appended to `rows` before the first run.
+
+    Parameters
+    ----------
+    size : Size
+    threads : int
+        Of our methods and of OpenCV.
+    methods : sequence of str
+        Methods; table II has ``"zncc+sgm"`` only.
+    images : pair of (H, W) uint8
+    rounds : int
+        Timed calls of each, after one that is not.
+    rows : list of PipelineRow
+    with_peers : bool
+        OpenCV's 3WAY and HH too.
+    runtimes : str or None
+        A refiner that is timed in each runtime and precision too.
+    step : callable
+        Called with a few words after each call.
+    """
+    options = {"max_disparity": size.levels, "threads": threads}
+    calls: dict[str, Callable[[], object]] = {}
+    times: dict[str, list[float]] = {}
+    with opencv_threads(threads):
+        for suffix, configuration in _configurations(methods, options, runtimes):
+            label, printed = configuration.name + suffix, None
+            if configuration.label == "S4" and not suffix:
+                printed = _PRINTED.get(configuration.setting)
+            row = PipelineRow(label, size.name, threads, times.setdefault(label, []), printed=printed)
+            rows.append(row)
+            call, row.missing = _warmed(configuration, images)
+            if call is not None:
+                calls[label] = _watching(configuration.matcher, call, images, row)
+            step(f"{size.name}: {label}, first call")
+        for key in (THREE_WAY, HH) if with_peers else ():
+            rows.append(PipelineRow(key, size.name, threads, times.setdefault(key, [])))
+            peer: Call = PEERS[key].make(size.levels)
+            peer(*images)
+            calls[key] = lambda peer=peer: peer(*images)  # type: ignore[misc]
+            step(f"{size.name}: {key}, first call")
+        round_robin(calls, rounds, times, step=lambda name: step(f"{size.name}, {threads} threads: {name}"))
+
+
+def _configurations(
+    methods: Sequence[str], options: Mapping[str, Any], runtimes: str | None
+) -> list[tuple[str, Configuration]]:
+    """Return what is timed, each with what its name says beyond its setting."""
+    found = [("", configuration) for configuration in build(methods, settings_at_hand(), options)]
+    for backend in BACKENDS if runtimes is not None else ():
+        for precision in PRECISIONS if backend == "openvino" else ("fp32",):
+            chosen = {**options, "backend": backend, "precision": precision}
+            found += [(f", {backend} {precision}", c) for c in build(methods, [str(runtimes)], chosen)]
+    return found
+
+
+def as_json(rows: Sequence[PipelineRow]) -> list[dict[str, Any]]:
+    """Return the rows as ``pipeline`` of the JSON."""
+    found = []
+    for row in rows:
+        ours = row.spread
+        found.append(
+            {
+                "name": row.name,
+                "size": row.size,
+                "threads": row.threads,
+                "runs": len(row.seconds),
+                "median_ms": None if ours is None else ours.median,
+                "q25_ms": None if ours is None else ours.q25,
+                "q75_ms": None if ours is None else ours.q75,
+                "parts_ms": {group: row.part_ms(group) for group in GROUPS},
+                "missing": row.missing,
+                "published_ms": None if row.printed is None else _jetson(row.printed),
+                "published_row": row.printed,
+            }
+        )
+    return found
+
+
+def print_pipeline(sizes: Sequence[Size], rows: Sequence[PipelineRow]) -> None:
+    """Print one table for each size, then what is missing, and what the published times are."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    for size in sizes:
+        here = [row for row in rows if row.size == size.name]
+        if not here:
+            continue
+        table = new_table(f"table II of the paper, {size.name}: {size.width}x{size.height}, {size.levels} levels")
+        for head in ("threads", "ms", "q25-q75", *GROUPS, "published, TX2", "published, AGX"):
+            table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
+        for row in here:
+            ours, theirs = row.spread, _jetson(row.printed or "")
+            table.add_row(
+                f"{row.name} (missing)" if row.missing else row.name,
+                str(row.threads),
+                "-" if ours is None else format_ms(ours.median),
+                "-" if ours is None else f"{format_ms(ours.q25)}-{format_ms(ours.q75)}",
+                *("-" if (ms := row.part_ms(group)) is None else format_ms(ms) for group in GROUPS),
+                *(f"{theirs[board]:.2f}" if board in theirs else "-" for board in ("TX2", "AGX")),
+            )
+        console.print(table)
+    for line in dict.fromkeys(f"missing: {row.name}: {row.missing}" for row in rows if row.missing):
+        console.print(line, markup=False, highlight=False)
+    note = (
+        f"published: {published.PAPER}, table II, on Jetson boards; it does not say at which size ZNCC+SGM ran, nor "
+        "whether the networks' times contain the matcher's (ours do)"
+    )
+    console.print(note, markup=False, highlight=False)
+
+
+def _jetson(row: str) -> Mapping[str, float]:
+    return published.TABLE_2.get(row, {})
+
+
+def _warmed(configuration: Configuration, images: tuple[Any, Any]) -> tuple[Matching | None, str | None]:
+    """Call a configuration once; return it, or why it cannot be called."""
+    if configuration.matcher is None:
+        return None, configuration.missing
+    try:
+        configuration.matcher(*images)
+    except Exception as error:  # a plug-in's own trouble
+        if configuration.setting in ("original", "linear"):
+            raise
+        return None, describe_error(error)
+    return configuration.matcher, None
+
+
+def _watching(matcher: Any, call: Matching, images: tuple[Any, Any], row: PipelineRow) -> Callable[[], object]:
+    """Return the call to time; it notes what the refiner took."""
+
+    def run() -> object:
+        watch = Watch(time.perf_counter)
+        with watched(matcher, watch, groups=True):
+            found = call(*images)
+        for group in GROUPS:
+            row.parts.setdefault(group, []).append(watch.seconds.get(group, 0.0))
+        return found
+
+    return run

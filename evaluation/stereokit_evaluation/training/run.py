@@ -1,0 +1,296 @@
+"""A training from its data to its weights, as ``stereokit train`` and the study start it.
+
+The result is a folder with ``weights.safetensors``, ``curves.csv``, ``curves.png``, and the checkpoint from which a
+killed run goes on when it is called again with the same options. With `folds` each group of frames is held out once.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from stereokit.cli.options import parse_settings
+from stereokit.errors import InputError, OptionError, StereokitError
+from stereokit.io import make_folder, write_bytes
+from stereokit.methods import check_levels, parse_method
+from stereokit_evaluation.common.progress import progress
+from stereokit_evaluation.data.datasets import load, select
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of, scene_pair
+
+__all__ = ["run_training"]
+
+_MATCHERS = ("S1", "S2", "S3", "S4")
+
+
+def run_training(
+    output: Path, refiner: str = "stereovae", *, dataset: str | None = None, root: Path | None = None,
+    frames: str | None = None, validation: str | None = None, folds: str | None = None, extra: Sequence[str] = (),
+    extra_share: float = 0.2, streets: int = 0, street_share: float = 0.5, method: Sequence[str] = _MATCHERS,
+    variants: int = 9, start: Path | None = None, preset: str = "default", settings: Sequence[str] = (),
+    max_disparity: int = 128, cache: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Train a refiner; killed, it goes on from its checkpoint when called again with the same options.
+
+    Parameters
+    ----------
+    output : Path
+        Folder of the result; made if missing.
+    refiner : str
+        Architecture, one of `stereokit_refiners.weights.NETWORKS`.
+    dataset, root : str, Path, optional
+        A data set and its folder.
+    frames, validation, folds : str, optional
+        Frames to train on, to look at on the way, and groups to hold out in turn (``0-3/13-17``).
+    extra : sequence of str
+        More frames to train on, ``DATASET:ROOT``, never held out; `extra_share` of the crops.
+    streets : int
+        Synthetic streets to train on; `street_share` of the crops.
+    method : sequence of str
+        Matchers whose maps are trained on.
+    variants : int
+        Variants of each frame and matcher.
+    start : Path, optional
+        Weights to begin with.
+    preset, settings : str, sequence of str
+        Settings of `stereokit_refiners.training.settings`, ``KEY=VALUE``.
+    max_disparity : int
+        Disparities of the matchers, full-size pixels.
+    cache : Path, optional
+        Folder of coarse maps; by default ``output/cache``.
+
+    Returns
+    -------
+    dict
+        What was trained, on what, and the scores of held-out frames; ``"rank"`` is this process' number.
+
+    Raises
+    ------
+    OptionError, InputError, FileError, StereokitError
+        If an option breaks its rule, frames have no ground truth, files cannot be used, or torch is not installed.
+    """
+    torch = _torch()
+    from stereokit_refiners.runtimes.encode import check_form
+    from stereokit_refiners.training.loop import Source
+    from stereokit_refiners.training.samples import Shelf, store_variant
+    from stereokit_refiners.weights import NETWORKS, read
+
+    chosen = _settings(preset, settings)
+    if refiner not in NETWORKS:
+        raise OptionError(f"refiner to train must be one of {', '.join(NETWORKS)}, got {refiner!r}")
+    if dataset is None and streets < 1 and not extra:
+        raise OptionError("dataset, extra or streets must be given, got none of them")
+    if folds is not None and (dataset is None or validation is not None):
+        raise OptionError(f"folds must come with a dataset and without validation, got {folds!r}")
+    if not (0 <= extra_share and 0 <= street_share and extra_share + street_share <= 1) or streets < 0 or variants < 1:
+        raise OptionError(
+            "street_share and extra_share must be at least 0 and together at most 1, streets at least 0 and variants "
+            f"at least 1, got {street_share:g}, {extra_share:g}, {streets} and {variants}"
+        )
+    content = None if start is None else read(start)
+    if content is not None and content.network != refiner:
+        raise OptionError(f"start must hold weights of {refiner!r}, got those of {content.network!r}")
+    methods = list(method)
+    for name in methods:
+        parse_method(name)
+    check_levels(0, max_disparity)
+    check_form(chosen.form, NETWORKS[refiner].forms, refiner)
+    everything = [] if dataset is None else list(load(dataset, root))
+    groups = _groups(everything, frames, validation, folds)
+    more = _extra(extra)
+    tested_names = {f"{dataset}/{frame.name}" for _, part in groups for frame in part}
+    if common := sorted(tested_names & more.keys()):
+        raise OptionError(f"extra must not bring frames that are held out, got {common[0]!r}")
+    if dataset is not None and not all(training for training, _ in groups):
+        raise OptionError("frames must leave some to train on beside those held out, got none")
+    for frame in (*more.values(), *(f for pair in groups for part in pair for f in part)):
+        if frame.noc is None and frame.occ is None:
+            raise InputError(f"frame {frame.name} has no ground truth to train on")
+    if cache is not None:
+        make_folder("cache", cache)
+    make_folder("output", output)
+    held = output / "cache" if cache is None else cache
+    world = _join_group(torch)
+
+    def stored(frame: Frame, numbers: range, step: Callable[..., None]) -> list[Path]:
+        pair = pair_of(frame)
+        found = []
+        for name in methods:
+            for number in numbers:
+                found.append(store_variant(pair, name, chosen.seed, number, max_disparity, held))
+                step(f"{frame.name} {name}")
+        return found
+
+    def stored_streets(step: Callable[..., None]) -> list[Path]:
+        found = []
+        for k in range(streets):
+            pair = scene_pair(FIRST_SEED + k, held)
+            for n in (0, 1):
+                name = methods[(k + 2 * n) % len(methods)]
+                found.append(store_variant(pair, name, chosen.seed, n + 1, max_disparity, held))
+                step(pair.name)
+        return found
+
+    trained = {frame.name: frame for training, _ in groups for frame in training} | more
+    tested = {frame.name: frame for _, held_out in groups for frame in held_out}
+    total = (len(trained) * variants + len(tested)) * len(methods) + 2 * streets
+    with progress(total) as (_, step):
+        maps = {name: stored(frame, range(variants), step) for name, frame in trained.items()}
+        truth = {name: stored(frame, range(1), step) for name, frame in tested.items()}
+        scenes = stored_streets(step)
+    results = []
+    for number, (training, held_out) in enumerate(groups):
+        mine = [path for frame in training for path in maps[frame.name]]
+        others = [path for name in more for path in maps[name]]
+        of_streets = (street_share if mine or others else 1.0) if scenes else 0.0
+        of_others = (extra_share if mine else 1 - of_streets) if others else 0.0
+        shares = ((scenes, of_streets), (mine, 1 - of_streets - of_others), (others, of_others))
+        sources = [Source(Shelf(paths), share) for paths, share in shares if paths and share > 0]
+        folder = output if folds is None else output / f"fold-{number}"
+        where = [(frame.name, name) for frame in held_out for name in methods]
+        looked_at = Shelf([path for frame in held_out for path in truth[frame.name]])
+        seen = [*(f"{dataset}/{frame.name}" for frame in training), *more]
+        outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world, seen)
+        results.append(outcome | {"held_out": [frame.name for frame in held_out]})
+    return {
+        "refiner": refiner, "settings": asdict(chosen), "methods": methods, "streets": streets,
+        "frames": sorted(trained), "results": results, "pooled": _pooled(results, methods), "rank": world[0],
+    }  # fmt: skip
+
+
+def _torch() -> Any:
+    try:
+        import torch
+    except ImportError:
+        raise StereokitError("training needs torch, which is not installed: pip install 'stereokit[train]'") from None
+    return torch
+
+
+def _settings(preset: str, given: Sequence[str]) -> Any:
+    from stereokit_refiners.training.loop import PRESETS, Settings
+
+    if preset not in PRESETS:
+        raise OptionError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+    options = parse_settings(given, frozenset())
+    known = [f.name for f in fields(Settings)]
+    for name in options:
+        if name not in known:
+            raise OptionError(f"no setting named {name!r}. Known: {', '.join(known)}")
+    try:
+        return Settings(**{**PRESETS[preset], **options})
+    except TypeError as error:
+        raise OptionError(f"a setting has a value of the wrong type ({error})") from None
+
+
+def _groups(
+    everything: Sequence[Frame], frames: str | None, validation: str | None, folds: str | None
+) -> list[tuple[list[Frame], list[Frame]]]:
+    """Return (training, held out) pairs of frames; no frame is in both."""
+    if folds is None:
+        held_out = select(everything, validation) if validation is not None else []
+        training = [f for f in select(everything, frames) if f not in held_out]
+        return [(training, held_out)]
+    parts = [select(everything, part) for part in folds.split("/")]
+    names = [frame.name for part in parts for frame in part]
+    if len(parts) < 2 or len(set(names)) < len(names):
+        raise OptionError(f"folds must be two groups or more that share no frame, got {folds!r}")
+    extra = [] if frames is None else [f for f in select(everything, frames) if f.name not in names]
+    return [([*(f for other in parts if other is not part for f in other), *extra], part) for part in parts]
+
+
+def _extra(given: Sequence[str]) -> dict[str, Frame]:
+    """Return the frames of further data sets by names that clash with no other."""
+    frames = {}
+    for text in given:
+        dataset, colon, root = text.partition(":")
+        if not colon or not root:
+            raise OptionError(f"extra must be DATASET:ROOT, got {text!r}")
+        for frame in load(dataset, root):
+            name = f"{dataset}/{frame.name}"
+            if name in frames:
+                raise OptionError(f"extra must not bring two frames called {name!r}, got {text!r}")
+            frames[name] = frame
+    return frames
+
+
+def _join_group(torch: Any) -> tuple[int, int]:
+    """Join the processes that torchrun started; return this one's number, and how many there are."""
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size == 1:
+        return 0, 1
+    torch.distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return int(os.environ["RANK"]), size
+
+
+def _train_one(
+    refiner: str, sources: Any, looked_at: Sequence[Any], where: Sequence[tuple[str, str]], settings: Any, start: Any,
+    folder: Path, world: tuple[int, int], seen: Sequence[str],
+) -> dict[str, Any]:  # fmt: skip
+    """Train, calibrate, write the folder; return the counts of bad and known pixels by matcher."""
+    from stereokit_refiners.training.loop import bad_pixels, calibrated, fit, predict, restored
+    from stereokit_refiners.weights import NETWORKS, WeightFile, write
+
+    network = NETWORKS[refiner]
+    make_folder("output", folder)
+    with progress(settings.steps) as (_, step):
+        at = 0
+
+        def tell(done: int, loss: float, score: float | None) -> None:
+            nonlocal at
+            shown = "" if score is None else f" D1 {score:.2f} %"
+            step(f"{folder.name} loss {loss:.2f}{shown}", done - at)
+            at = done
+
+        arrays, history = fit(
+            network, sources, looked_at, settings, start=None if start is None else start.arrays,
+            checkpoint=folder / "checkpoint.pt", progress=tell, rank=world[0], world=world[1],
+        )  # fmt: skip
+    module = restored(network, arrays)
+    counts: dict[str, list[int]] = {}
+    for sample, (_, name) in zip(looked_at, where, strict=True):
+        bad, known = bad_pixels(predict(module, settings.form, sample), sample)
+        total = counts.setdefault(name, [0, 0])
+        total[0] += bad
+        total[1] += known
+    if world[0] == 0:
+        ranges = calibrated(module, settings.form, sources)
+        notes = {
+            "frames": sorted(seen),
+            "settings": asdict(settings),
+            "start": None if start is None else start.fingerprint,
+        }
+        write(folder / "weights.safetensors", WeightFile(refiner, settings.form, arrays, ranges, notes))
+        write_bytes(folder / "curves.csv", history.csv())
+        write_bytes(folder / "curves.png", _curves(history))
+    return {"folder": str(folder), "bad_and_known": counts, "steps": history.rows[-1][0] if history.rows else 0}
+
+
+def _curves(history: Any) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    left = figure.add_subplot()
+    steps = [row[0] for row in history.rows]
+    left.plot(steps, [row[1] for row in history.rows], color="tab:blue", label="training loss")
+    left.set_xlabel("step")
+    left.set_ylabel("training loss", color="tab:blue")
+    if any(row[2] is not None for row in history.rows):
+        right = left.twinx()
+        right.plot(steps, [row[2] for row in history.rows], color="tab:red", label="validation D1")
+        right.set_ylabel("validation D1 noc, %", color="tab:red")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    return buffer.getvalue()
+
+
+def _pooled(results: Sequence[dict[str, Any]], methods: Sequence[str]) -> dict[str, float | None]:
+    pooled: dict[str, float | None] = {}
+    for name in methods:
+        counts = [r["bad_and_known"][name] for r in results if name in r["bad_and_known"]]
+        known = sum(n for _, n in counts)
+        pooled[name] = 100 * sum(bad for bad, _ in counts) / known if known else None
+    return pooled

@@ -1,0 +1,282 @@
+"""Learned refiners: a network's weights behind the contract of `stereokit_refiners.contract`.
+
+The runtime is whatever is installed: OpenVINO first, then ONNX Runtime, then torch; and the precision what the
+processor is fast at: int8 where it has the instructions and the weights were calibrated, else bfloat16, else fp32.
+Networks compiled for a size are kept, a few at a time.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.errors import OptionError, StereokitError
+from stereokit.postprocess import fill
+from stereokit.result import Disparity
+from stereokit_refiners.contract import on_tensors
+from stereokit_refiners.runtimes.compose import compose
+from stereokit_refiners.runtimes.encode import encode
+from stereokit_refiners.weights import WeightFile, network_named, read, shipped
+
+if TYPE_CHECKING:
+    from stereokit.cuda.pipeline import DeviceDisparity
+
+__all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner"]
+
+BACKENDS = ("openvino", "onnxruntime", "torch")
+PRECISIONS = ("fp32", "bf16", "int8")
+_KEPT = 4  # compiled networks
+
+Run = Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]
+"""From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedRefiner:
+    """A refiner that is a network.
+
+    Parameters
+    ----------
+    weights : str or None
+        A weight file; None takes those that come with the package.
+    backend : {"auto", "openvino", "onnxruntime", "torch"}
+        What runs the network; "auto" is the first that is installed.
+    precision : {"auto", "fp32", "bf16", "int8"}
+        bf16 and int8 need OpenVINO. "auto" is the fastest that this processor has instructions for.
+
+    Raises
+    ------
+    OptionError
+        If an option breaks its rule, or the two do not go together.
+    FileError
+        If the weights cannot be used.
+    StereokitError
+        If the backend is not installed.
+    """
+
+    weights: str | None = None
+    backend: str = "auto"
+    precision: str = "auto"
+    architecture: ClassVar[str] = ""
+    _file: WeightFile = field(init=False, repr=False, compare=False)
+    _compiled: _Compiled = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.weights is None and not self.architecture:
+            raise OptionError("refiner 'file' needs weights, the path of a .safetensors file, got none")
+        if not isinstance(self.weights, (str, os.PathLike, type(None))):
+            raise OptionError(f"weights must be the path of a .safetensors file, got {self.weights!r}")
+        self._use(shipped(self.architecture) if self.weights is None else read(self.weights))
+
+    @classmethod
+    def of(cls, content: WeightFile, *, backend: str = "auto", precision: str = "auto") -> LearnedRefiner:
+        """Return a refiner of weights that are in memory."""
+        made = object.__new__(cls)
+        for name, value in (("weights", None), ("backend", backend), ("precision", precision)):
+            object.__setattr__(made, name, value)
+        made._use(content)
+        return made
+
+    def _use(self, content: WeightFile) -> None:
+        if self.architecture and content.network != self.architecture:
+            raise OptionError(
+                f"weights of refiner {self.architecture!r} must be its own, got those of {content.network!r}"
+            )
+        object.__setattr__(self, "_file", content)
+        object.__setattr__(self, "backend", _backend(self.backend))
+        object.__setattr__(self, "precision", _precision(self.precision, self.backend, content))
+        object.__setattr__(self, "_compiled", _Compiled(content, self.backend, self.precision))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, LearnedRefiner) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
+    def __getstate__(self) -> dict[str, Any]:
+        names = ("weights", "backend", "precision", "_file")
+        return {name: getattr(self, name) for name in names}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        content = state.pop("_file")
+        for name, value in state.items():
+            object.__setattr__(self, name, value)
+        self._use(content)
+
+    @property
+    def fingerprint(self) -> str:
+        """What the result depends on, beside the inputs."""
+        return f"{self._file.fingerprint}-{self.backend}-{self.precision}"
+
+    @property
+    def trained_on(self) -> frozenset[str]:
+        """The frames that the weights were trained on, ``DATASET/NAME``, as far as their file says."""
+        return frozenset(str(name) for name in self._file.notes.get("frames", ()))
+
+    @property
+    def needs_confidence(self) -> bool:
+        """Whether the coarse map must come with the matcher's confidence."""
+        return "confidence" in network_named(self._file.network).inputs
+
+    @property
+    def needs_candidates(self) -> bool:
+        """Whether the coarse map must come with the matcher's candidates."""
+        return "candidates" in network_named(self._file.network).inputs
+
+    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
+        """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
+
+        Where the coarse map is NaN, the result is; the network sees it filled. Networks know disparities from 0 on:
+        one whose map goes below sees it lifted by as much.
+        """
+        network = network_named(self._file.network)
+        rows, columns = left.shape
+        height, width = coarse.disparity.shape
+        if (height, width) != (-(-rows // 2), -(-columns // 2)):
+            raise OptionError(f"coarse map must be half the size of left {left.shape}, got {coarse.disparity.shape}")
+        disparity = coarse.disparity
+        unknown = np.isnan(disparity)
+        gaps = bool(unknown.any())
+        if gaps:
+            disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
+        below, beside = -height % network.multiple, -width % network.multiple
+        candidates = coarse.candidates if self.needs_candidates else None
+        shift = np.float32(min(0.0, *(np.floor(a.min()) for a in (disparity, candidates) if a is not None)))
+        disparity = _extended((disparity - shift) * np.float32(2), below, beside)
+        confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
+        image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
+        two = None if candidates is None else _extended_each((candidates - shift) * np.float32(2), below, beside)
+        inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
+        head = self._compiled.run(inputs, threads)
+        full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
+        if shift < 0:
+            full += 2 * shift
+        known = _doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
+        if gaps:
+            missing = _doubled(unknown.view(np.uint8), rows, columns).astype(bool)
+            full[missing] = np.nan
+            known &= ~missing
+        sure = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
+        return Disparity(full, known, sure)
+
+    def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+        """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
+        found: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class StereoVaeRefiner(LearnedRefiner):
+    """StereoVAE (Chang et al. 2023), trained on the maps of S1 to S4."""
+
+    architecture: ClassVar[str] = "stereovae"
+
+
+@dataclass(frozen=True, eq=False)
+class CnnRefiner(LearnedRefiner):
+    """The paper's network without the latent."""
+
+    architecture: ClassVar[str] = "cnn"
+
+
+@dataclass(frozen=True, eq=False)
+class PyramidRefiner(LearnedRefiner):
+    """The network of this project: see `stereokit_refiners.networks.pyramid`."""
+
+    architecture: ClassVar[str] = "stereokit"
+
+
+def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:
+    if below == 0 and beside == 0:
+        return np.ascontiguousarray(image)
+    return np.asarray(cv2.copyMakeBorder(image, 0, below, 0, beside, cv2.BORDER_REPLICATE))
+
+
+def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArray[np.float32]:
+    return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
+
+
+def _doubled(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
+    """Return each pixel four times, cut to a size."""
+    size = (2 * image.shape[1], 2 * image.shape[0])
+    large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)).reshape(size[1], size[0])
+    return np.ascontiguousarray(large[:rows, :columns])
+
+
+def _backend(name: str) -> str:
+    if name != "auto" and name not in BACKENDS:
+        raise OptionError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
+    there = [b for b in BACKENDS if importlib.util.find_spec(b) is not None]
+    if "onnxruntime" in there and importlib.util.find_spec("onnx") is None:
+        there.remove("onnxruntime")
+    if name == "auto":
+        if not there:
+            raise StereokitError("learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[fast]'")
+        return there[0]
+    if name not in there:
+        extra = {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}[name]
+        raise StereokitError(f"backend {name!r} is not installed: pip install 'stereokit[{extra}]'")
+    return name
+
+
+def _precision(name: str, backend: str, content: WeightFile) -> str:
+    if name != "auto" and name not in PRECISIONS:
+        raise OptionError(f"precision must be one of auto, {', '.join(PRECISIONS)}, got {name!r}")
+    if backend != "openvino":
+        if name not in ("auto", "fp32"):
+            raise OptionError(f"precision must be fp32 with backend {backend!r}, got {name!r}")
+        return "fp32"
+    if name == "int8" and not content.ranges:
+        raise OptionError("precision must not be int8 with weights that were not calibrated for it")
+    if name != "auto":
+        return name
+    from llvmlite import binding
+
+    features = binding.get_host_cpu_features()
+    if content.ranges and (features.get("avx512vnni") or features.get("avxvnni")):
+        return "int8"
+    return "bf16" if features.get("avx512bf16") or features.get("amx-bf16") else "fp32"
+
+
+class _Compiled:
+    """The compiled networks of one refiner, by size and threads."""
+
+    def __init__(self, content: WeightFile, backend: str, precision: str) -> None:
+        self.content, self.backend, self.precision = content, backend, precision
+        self._held: OrderedDict[tuple[int, int, int], Run] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def run(self, inputs: dict[str, NDArray[np.float32]], threads: int) -> NDArray[np.float32]:
+        """Return the head for encoded inputs."""
+        rows, columns = next(iter(inputs.values())).shape[1:]
+        key = (rows, columns, threads)
+        with self._lock:
+            runner = self._held.pop(key, None) or self._compile(rows, columns, threads)
+            self._held[key] = runner
+            while len(self._held) > _KEPT:
+                self._held.popitem(last=False)
+        return runner(inputs)
+
+    def _compile(self, rows: int, columns: int, threads: int) -> Run:
+        network = network_named(self.content.network)
+        if self.backend == "openvino":
+            from stereokit_refiners.runtimes.openvino import compiled
+
+            ranges = self.content.ranges if self.precision == "int8" else None
+            return compiled(network, self.content.arrays, rows, columns, threads, self.precision, ranges)
+        if self.backend == "onnxruntime":
+            from stereokit_refiners.runtimes.onnx import session
+
+            return session(network, self.content.arrays, threads)
+        from stereokit_refiners.runtimes.torch import runner
+
+        return runner(network, self.content.arrays)

@@ -1,0 +1,189 @@
+"""Refining torch tensors where they are: on a GPU, without a copy to the host.
+
+`TensorRefiner` is `LearnedRefiner` in torch from end to end (scaling, network, upsampling). It takes tensors, or
+anything that torch can view without a copy, such as the device arrays of numba or CuPy
+(``__cuda_array_interface__``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from stereokit.errors import InputError, OptionError
+from stereokit_refiners.runtimes.torch import Module, compose
+from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
+
+if TYPE_CHECKING:
+    from stereokit.cuda.pipeline import DeviceDisparity
+
+__all__ = ["TensorRefiner", "linear_on_device", "refine_on_device"]
+
+
+class TensorRefiner:
+    """A learned refiner of tensors.
+
+    Parameters
+    ----------
+    refiner : str or WeightFile
+        A name ("stereovae", "cnn", "stereokit"), the path of a ``.safetensors`` file, or its content.
+    device : str
+        Where to compute: "cuda", "cuda:1", "cpu".
+
+    Raises
+    ------
+    OptionError
+        If torch has no such device.
+    FileError
+        If the weights cannot be used.
+    """
+
+    def __init__(self, refiner: str | WeightFile, device: str = "cuda") -> None:
+        if isinstance(refiner, str):
+            refiner = read(refiner) if refiner.endswith(".safetensors") else shipped(refiner)
+        try:
+            self.device = torch.device(device)
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise OptionError(f"device must be one that torch has, got {device!r} ({reason})") from None
+        self.content = refiner
+        self.network = NETWORKS[refiner.network]
+        self._module = Module(self.network)
+        self._module.load(refiner.arrays)
+        self._module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._module.eval().requires_grad_(False)
+
+    def __call__(self, coarse: Any, confidence: Any, left: Any, candidates: Any = None) -> Tensor:
+        """Return the full-size map, on the device.
+
+        Parameters
+        ----------
+        coarse : (ceil(H/2), ceil(W/2)) float32
+            Half-size map in half-size pixels, without NaN.
+        confidence : (ceil(H/2), ceil(W/2)) float32, or None
+            The matcher's, 0 where nothing was measured; None for networks that do not look at it.
+        left : (H, W) uint8
+            Grey image.
+        candidates : (2, ceil(H/2), ceil(W/2)) float32, or None
+            The matcher's, half-size pixels; None for networks that do not look at them.
+
+        Returns
+        -------
+        (H, W) float32 tensor, full-size pixels
+
+        Raises
+        ------
+        InputError
+            If the sizes do not fit one another.
+        """
+        for name, given in (("confidence", confidence), ("candidates", candidates)):
+            if given is None and name in self.network.inputs:
+                raise InputError(f"{name} must be given for refiner {self.network.name!r}, got None")
+        disparity, image = (torch.as_tensor(x, device=self.device) for x in (coarse, left))
+        known = torch.zeros_like(disparity) if confidence is None else torch.as_tensor(confidence, device=self.device)
+        two = torch.stack([disparity] * 2) if candidates is None else torch.as_tensor(candidates, device=self.device)
+        if image.ndim != 2 or disparity.shape != ((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2):
+            found = f"{tuple(disparity.shape)} and {tuple(image.shape)}"
+            raise InputError(f"coarse must be (H/2, W/2), rounded up, of left (H, W), got {found}")
+        if known.shape != disparity.shape:
+            wanted, found = tuple(disparity.shape), str(tuple(known.shape))
+            raise InputError(f"confidence must have the shape of coarse {wanted}, got {found}")
+        if two.shape != (2, *disparity.shape):
+            rule = f"candidates must be two maps of the shape of coarse {tuple(disparity.shape)}"
+            raise InputError(f"{rule}, got {tuple(two.shape)}")
+        rows, columns = image.shape
+        height, width = disparity.shape
+        below, beside = -height % self.network.multiple, -width % self.network.multiple
+        with torch.inference_mode():
+            lowest = (
+                torch.minimum(disparity.min(), two.min()) if "candidates" in self.network.inputs else disparity.min()
+            )
+            shift = lowest.float().floor().clamp(max=0)  # as in LearnedRefiner; the host never sees it
+            disparity = _extended((disparity.float() - shift) * 2, below, beside)
+            known = _extended(known.float(), below, beside)
+            two = _extended((two.float() - shift) * 2, below, beside)
+            gray = _extended(image.float(), 2 * (height + below) - rows, 2 * (width + beside) - columns)
+            heads = self._module(self._encoded(disparity, known, two, gray))
+            full = compose(self.network.name, self.content.form, heads["map"], disparity, two)
+            return (full[0, 0, :rows, :columns] + 2 * shift).contiguous()
+
+    def _encoded(self, disparity: Tensor, confidence: Tensor, two: Tensor, left: Tensor) -> dict[str, Tensor]:
+        """Return the network's inputs: `stereokit_refiners.runtimes.encode.encode` in torch."""
+        literal = self.content.form == "literal"
+        gray = left / 255 if literal else (left / 255 - 0.4) * 4
+        encoded = {
+            "disparity": disparity / 256 if literal else disparity / 16 - 1.5,
+            "image": F.avg_pool2d(gray, 2),
+            "phases": F.pixel_unshuffle(gray, 2),
+            "confidence": confidence * 4 - 2,
+            "candidates": two / 16 - 1.5,
+        }
+        return {name: encoded[name] for name in self.network.inputs}
+
+
+def refine_on_device(
+    content: WeightFile, coarse: DeviceDisparity, left: Any, stream: Any
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Refine a map that lies on the GPU with a network; see `stereokit_refiners.contract.DeviceRefiner`."""
+    with _running_on(stream, left) as device:
+        refined = _held(content, str(device))(coarse.disparity, coarse.confidence, left, coarse.candidates)
+        rows, columns = refined.shape
+        sure = None if coarse.confidence is None else _doubled(_tensor(coarse.confidence), rows, columns)
+        return refined, _doubled(_tensor(coarse.valid), rows, columns), sure
+
+
+def linear_on_device(coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Upscale a map that lies on the GPU; see `stereokit_refiners.linear` and `DeviceRefiner`."""
+
+    def upscaled(image: Tensor) -> Tensor:
+        full = F.interpolate(image[None, None], scale_factor=2, mode="bilinear", align_corners=False)
+        return full[0, 0, :rows, :columns]
+
+    with _running_on(stream, left):
+        rows, columns = _tensor(left).shape
+        known = _doubled(_tensor(coarse.valid), rows, columns)
+        sure = None if coarse.confidence is None else upscaled(_tensor(coarse.confidence)) * (known != 0)
+        return upscaled(_tensor(coarse.disparity)) * 2, known, sure
+
+
+def _tensor(held: Any) -> Tensor:
+    """Return an array as a tensor of the same memory."""
+    return torch.as_tensor(held)
+
+
+@lru_cache(maxsize=8)
+def _held(content: WeightFile, device: str) -> TensorRefiner:
+    return TensorRefiner(content, device)
+
+
+@contextmanager
+def _running_on(stream: Any, left: Any) -> Iterator[torch.device]:
+    """Run torch's work on a stream of numba; yield the device that `left` lies on."""
+    device = _tensor(left).device
+    if device.type != "cuda":
+        yield device
+        return
+    address = int(stream)
+    chosen: Any = torch.cuda.default_stream(device)
+    if address:
+        chosen = torch.cuda.ExternalStream(address, device=device)  # type: ignore[no-untyped-call]
+    with torch.cuda.stream(chosen):
+        yield device
+
+
+def _doubled(image: Tensor, rows: int, columns: int) -> Tensor:
+    """Return each pixel four times, cut to a size."""
+    large = image.repeat_interleave(2, 0).repeat_interleave(2, 1)
+    return large[:rows, :columns].contiguous()
+
+
+def _extended(image: Tensor, below: int, beside: int) -> Tensor:
+    """Return (..., rows, columns) as (1, ..., rows + below, columns + beside), its border repeated; at least 1 map."""
+    return F.pad(image.reshape(1, -1, *image.shape[-2:]), (0, beside, 0, below), mode="replicate")

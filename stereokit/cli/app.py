@@ -1,0 +1,125 @@
+"""The command line: ``stereokit match``, ``list``, ``info`` and the commands of other packages.
+
+Other packages add commands through the entry-point group ``stereokit.commands``: each entry is a plain
+function with typer annotations. It is imported only when its command (or the list of all commands) is asked
+for, and one that cannot be imported says so without harming the rest. Everything heavy is imported inside the
+functions.
+
+Bad input ends with one line, ``error: ...``, on standard error and exit status 2; an interrupt with 130.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable
+from importlib import metadata
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from stereokit.cli.info import info, list_
+from stereokit.cli.match import match
+from stereokit.cli.output import version_of
+from stereokit.errors import StereokitError
+
+__all__ = ["app", "main"]
+
+_GROUP = "stereokit.commands"
+
+
+class _Commands(TyperGroup):
+    """The built-in commands and those found through entry points."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        own = super().list_commands(ctx)
+        return [*own, *sorted({entry.name for entry in metadata.entry_points(group=_GROUP)} - set(own))]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        command = super().get_command(ctx, cmd_name)
+        if command is None:
+            for entry in metadata.entry_points(group=_GROUP, name=cmd_name):
+                return _plugin(entry)
+        return command
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except StereokitError as error:
+            _fail(str(error), error)
+        except ModuleNotFoundError as error:
+            if (error.name or "stereokit").startswith("stereokit"):
+                raise
+            _fail(f"this needs the package {error.name!r}, which is not installed", error)
+        except MemoryError as error:
+            _fail(f"not enough memory: {error}" if str(error) else "not enough memory", error)
+        except KeyboardInterrupt as error:  # typer 0.12 would end with 1
+            raise typer.Exit(130) from error
+
+
+app = typer.Typer(
+    name="stereokit",
+    cls=_Commands,
+    help="Classical stereo matching: disparity maps from rectified pairs.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """Run the command line; the console entry point."""
+    try:
+        app(prog_name="stereokit")
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"stereokit {version_of('stereokit')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+app.command()(match)
+app.command("list")(list_)
+app.command()(info)
+
+
+def _plugin(entry: metadata.EntryPoint) -> Any:
+    single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    try:
+        function: Callable[..., Any] = entry.load()
+        summary = (inspect.getdoc(function) or "").split("\n\nParameters\n")[0]  # the rest is for programmers
+        single.command(entry.name, help=summary)(function)
+        command = typer.main.get_command(single)
+    except Exception as error:
+        reason = f"command {entry.name!r} cannot be loaded: {type(error).__name__}: {error}"
+
+        def unavailable(ctx: typer.Context) -> None:
+            raise StereokitError(reason)
+
+        single = typer.Typer(add_completion=False, rich_markup_mode=None)
+        anything = {"allow_extra_args": True, "ignore_unknown_options": True}
+        single.command(entry.name, help=f"Not available: {reason}", context_settings=anything, add_help_option=False)(
+            unavailable
+        )
+        command = typer.main.get_command(single)
+    command.name = entry.name
+    return command
+
+
+def _fail(message: str, error: BaseException) -> None:
+    typer.echo(f"error: {' '.join(message.splitlines())}", err=True)
+    raise typer.Exit(2) from error

@@ -1,0 +1,213 @@
+"""The command ``stereokit match``: one pair, one map, and what is made of it."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from stereokit.cli.options import (
+    DeviceOption,
+    FillOption,
+    JsonOption,
+    MaxDisparityOption,
+    MethodOption,
+    MinDisparityOption,
+    RefinerOption,
+    ScaleOption,
+    SettingsOption,
+    check_fits_png,
+    check_json,
+    described,
+    parse_settings,
+)
+from stereokit.cli.output import report, version_of, waiting
+from stereokit.errors import InputError, OptionError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stereokit.calibration import Calibration
+    from stereokit.result import Disparity
+
+__all__ = ["match"]
+
+
+def match(
+    left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a rectified pair.")],
+    right_image: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FILE", help=".png (KITTI, x256), .pfm, .npy or .tiff."),
+    ],
+    method: MethodOption = "zncc+sgm",
+    max_disparity: MaxDisparityOption = 128,
+    min_disparity: MinDisparityOption = 0,
+    scale: ScaleOption = 1.0,
+    refiner: RefinerOption = None,
+    fill: FillOption = None,
+    threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
+    device: DeviceOption = "auto",
+    settings: SettingsOption = None,
+    color: Annotated[Path | None, typer.Option(metavar="FILE", help="Also a Turbo coloured picture.")] = None,
+    right: Annotated[Path | None, typer.Option(metavar="FILE", help="Also the right view's map.")] = None,
+    confidence: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also the confidence: .npy, or .png (16-bit, x65535).")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Middlebury, KITTI or JSON calibration, for --ply.")
+    ] = None,
+    cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
+    ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Also a point cloud, metres.")] = None,
+    memory: Annotated[str | None, typer.Option(metavar="BYTES", help="Match in windows that fit, such as 2GB.")] = None,
+    overlap: Annotated[int | None, typer.Option(help="Margin of the windows of --memory, pixels.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Match LEFT and RIGHT and write the disparity map.
+
+    Everything is checked before matching starts. The first run on a machine also compiles, once. With --memory the
+    images (.npy, .tiff or any other) are matched in windows, and the map goes to .npy or tiled .tiff as it grows.
+    """
+    import numpy as np
+
+    from stereokit import io
+
+    suffixes = {
+        "--output": (*io.DISPARITY_SUFFIXES, ".tif"),
+        "--color": (".png", ".jpg", ".jpeg", ".tiff", ".tif", ".bmp", ".ppm"),
+        "--right": (*io.DISPARITY_SUFFIXES, ".tif"),
+        "--confidence": (".npy", ".png"),
+        "--ply": (".ply",),
+    }
+    paths = (output, color, right, confidence, ply)
+    outputs = {name: path for name, path in zip(suffixes, paths, strict=True) if path is not None}
+    for name, path in outputs.items():
+        io.check_output(path, suffixes[name], name)
+        if name in ("--output", "--right") and path.suffix.lower() == ".png":
+            check_fits_png(name, min_disparity, max_disparity)
+    outputs.update(check_json(json_file))
+    _check_distinct({"LEFT": left, "RIGHT": right_image, "--calibration": calibration}, outputs)
+    if (ply is None) != (calibration is None):
+        raise OptionError("--ply and --calibration go together, got only one of them")
+    chosen = parse_settings(settings or [])
+    wanted = {"fill": fill, "right": right and True, "confidence": confidence and True}
+    chosen.update({name: value for name, value in wanted.items() if value is not None})
+    matching: dict[str, Any] = {
+        "max_disparity": max_disparity,
+        "min_disparity": min_disparity,
+        "scale": scale,
+        "refiner": refiner,
+        "threads": threads,
+        "device": device,
+    }
+    if memory is not None or overlap is not None:
+        for name in ("--color", "--right", "--confidence", "--ply"):
+            if name in outputs:
+                raise OptionError(f"{name} is not available with --memory and --overlap")
+        from stereokit.cli.match_large import match_in_windows
+
+        done, shown = match_in_windows(left, right_image, output, method, memory, overlap, {**matching, **chosen})
+        report({**done, "options": chosen, "version": version_of("stereokit")}, [shown], json_file)
+        return
+
+    from stereokit.matching import Matcher
+
+    matcher = Matcher(method, **matching, **chosen)
+    images = io.read_image(left), io.read_image(right_image)
+    height, width = images[0].shape[:2]
+    if images[1].shape[:2] != (height, width):
+        sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
+        raise InputError(f"LEFT and RIGHT must have the same size, got {sizes}")
+    camera = _read_camera(calibration, cameras, width, height)
+
+    with waiting("Matching (the first run also compiles) ..."):
+        small = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
+        matcher(*small)  # compiles, so that the time below is that of matching
+        start = time.perf_counter()
+        result = matcher(*images)
+        seconds = time.perf_counter() - start
+
+    result.save(output)
+    if color is not None:
+        io.write_image(color, result.color())
+    if right is not None:
+        io.write_disparity(right, _present(result.right, "--right", matcher.method))
+    if confidence is not None:
+        _write_confidence(confidence, _present(result.confidence, "--confidence", matcher.method))
+    if ply is not None and camera is not None:
+        _write_cloud(ply, result, camera, images[0])
+    content = {
+        "left": str(left),
+        "right": str(right_image),
+        "outputs": {name.removeprefix("--"): str(path) for name, path in outputs.items() if name != "--json"},
+        "width": width,
+        "height": height,
+        **described(matcher),
+        "options": chosen,
+        "density": result.density,
+        "seconds": seconds,
+        "version": version_of("stereokit"),
+    }
+    table = Table("Method", "Size", "Disparities", "Density", "Seconds", "Output")
+    table.add_row(
+        matcher.method,
+        f"{width}x{height}",
+        f"{matcher.min_disparity} .. {matcher.max_disparity - 1}",
+        f"{100 * result.density:.1f} %",
+        f"{seconds:.3f}",
+        str(output),
+    )
+    report(content, [table], json_file)
+
+
+def _check_distinct(inputs: dict[str, Path | None], outputs: dict[str, Path]) -> None:
+    taken = {os.path.realpath(path): name for name, path in inputs.items() if path is not None}
+    for name, path in outputs.items():
+        other = taken.setdefault(os.path.realpath(path), name)
+        if other != name:
+            raise OptionError(f"{name} and {other} must be different files, got {str(path)!r} for both")
+
+
+def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height: int) -> Calibration | None:
+    if path is None:
+        return None
+    from stereokit.calibration import read_calibration
+
+    camera = read_calibration(path, cameras)
+    camera.check_size(width, height)
+    return camera
+
+
+def _present(array: NDArray[Any] | None, option: str, method: str) -> NDArray[Any]:
+    if array is None:
+        raise OptionError(f"{option}: method {method!r} with these options gives none")
+    return array
+
+
+def _write_confidence(path: Path, confidence: NDArray[Any]) -> None:
+    import numpy as np
+
+    from stereokit import io
+
+    if path.suffix.lower() == ".npy":
+        io.write_disparity(path, confidence)
+    else:
+        steps = np.rint(np.clip(np.nan_to_num(confidence), 0, 1) * 65535)
+        io.write_image(path, steps.astype(np.uint16))
+
+
+def _write_cloud(path: Path, result: Disparity, camera: Calibration, image: NDArray[Any]) -> None:
+    import numpy as np
+
+    from stereokit import io
+
+    points = result.points(camera)
+    kept = np.isfinite(points).all(axis=2)
+    white = {"uint8": 255.0, "uint16": 65535.0}.get(str(image.dtype)) or max(float(np.nanmax(image)), 1e-9)
+    colors = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
+    scaled = np.rint(np.clip(np.nan_to_num(colors[kept] / white), 0, 1) * 255).astype(np.uint8)
+    io.write_ply(path, points[kept], scaled)

@@ -1,0 +1,349 @@
+"""Matching on the GPU: the stages of `stereokit.Matcher` as launches on one stream, with nothing in between.
+
+Every stage is the twin of the CPU's and gives the same integers and floats, so the maps are those of the CPU. Images
+of the host are checked there, as for the CPU, and uploaded; images of 8 bits that lie on the device already are taken
+from there, and their map stays there. Buffers remain on the device from call to call; a call that comes while others
+are running gets a queue, with buffers, of its own.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stereokit.aggregation.dt import Dt
+from stereokit.aggregation.dt_cuda import aggregate as aggregate_dt
+from stereokit.aggregation.sgm import Sgm
+from stereokit.aggregation.sgm_cuda import aggregate as aggregate_sgm
+from stereokit.costs import census_cuda, zncc_cuda
+from stereokit.costs.census import Census
+from stereokit.costs.rows import Cost, Levels
+from stereokit.costs.rows_cuda import Scene
+from stereokit.costs.zncc import Zncc
+from stereokit.cuda.kernel import Queue, blocks_for, cuda
+from stereokit.cuda.stream import DeviceQueue, stream_of
+from stereokit.errors import DeviceError, InputError
+from stereokit.images.gray import GrayPair
+from stereokit.images.prepare_cuda import flip, halve, smooth, take
+from stereokit.postprocess.chain import Chain
+from stereokit.postprocess.chain_cuda import post_process
+from stereokit.result import Disparity
+from stereokit.selection.wta_cuda import Maps, doubt
+
+__all__ = ["CudaPipeline", "DeviceDisparity", "Settings"]
+
+Shape = tuple[int, int]
+
+
+class Settings(NamedTuple):
+    """What of the options of `stereokit.Matcher` the stages need, checked there."""
+
+    cost: Cost
+    aggregation: Any
+    levels: Levels  # of the size at which is matched
+    half: bool  # match at half size
+    smooth: float
+    outside: float | None
+    subpixel: bool
+    uniqueness: float
+    confidence: int  # 0 none, 1 the confidence, 2 the candidates too
+    right: bool
+    smp: bool
+    speckle: float
+    fill: str | None
+    median: int
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceDisparity:
+    """A disparity map that stays on the GPU; each array has ``__cuda_array_interface__``.
+
+    The arrays are the caller's own, no later call writes to them. They are ready when the stream is on which they
+    were made.
+
+    Attributes
+    ----------
+    disparity : (H, W) float32 on the device
+        Pixels, NaN where invalid. Dense after a fill.
+    valid : (H, W) uint8 on the device
+        Not 0 where the disparity was measured.
+    confidence : (H, W) float32 on the device, or None
+        From 0, no better than another disparity, to 1.
+    right : (H, W) float32 on the device, or None
+        The map of the right view.
+    candidates : (2, H, W) float32 on the device, or None
+        As `stereokit.Disparity` has them.
+    """
+
+    disparity: Any
+    valid: Any
+    confidence: Any = None
+    right: Any = None
+    candidates: Any = None
+
+
+class _Found(NamedTuple):
+    """Maps of a match on the device: resident and flat, the next match on the queue writes over them."""
+
+    disparity: Any
+    valid: Any
+    confidence: Any = None
+    candidates: Any = None
+
+
+class _Image(NamedTuple):
+    """An image on the device, flat."""
+
+    pixels: Any
+    dtype: np.dtype[Any]
+    channels: int
+    shape: Shape
+
+
+def _from_device(name: str, image: Any) -> _Image:
+    """Return an image of the caller on the device, without a copy."""
+    if not hasattr(image, "__cuda_array_interface__"):
+        raise InputError(f"left and right must both lie on the device or both on the host, but {name} does not")
+    held = cuda.as_cuda_array(image)
+    if held.dtype != np.uint8:
+        raise InputError(
+            f"{name} must be uint8 on the device, got {held.dtype}; images of the host may have other types"
+        )
+    if not (held.ndim == 2 or (held.ndim == 3 and held.shape[2] == 3)) or 0 in held.shape:
+        raise InputError(f"{name} must be grey (H, W) or RGB (H, W, 3), got shape {tuple(held.shape)}")
+    if not held.is_c_contiguous():
+        raise InputError(f"{name} must be C-contiguous on the device, got strides {tuple(held.strides)}")
+    channels = 1 if held.ndim == 2 else 3
+    return _Image(held.reshape(held.size), held.dtype, channels, tuple(held.shape[:2]))
+
+
+def _reshaped(held: Any, shape: tuple[int, ...]) -> Any:
+    """Return a flat array of the device as one of this shape."""
+    return held.reshape(*shape)
+
+
+def _flat(held: Any) -> Any:
+    """Return an array of the device as a flat one of numba."""
+    held = cuda.as_cuda_array(held)
+    return held.reshape(held.size)
+
+
+def new_queue(stream: Any) -> Any:
+    """Return a queue of the GPU on a stream of numba, or on one of its own."""
+    return DeviceQueue(stream)
+
+
+class CudaPipeline:
+    """A matcher's way through the GPU; may be used by many threads at the same time.
+
+    Parameters
+    ----------
+    settings : Settings
+        Options.
+    refine : stereokit_refiners.contract.DeviceRefiner or None
+        What brings maps of half size to full size on the device; None where refiners run on the host.
+
+    Raises
+    ------
+    DeviceError
+        If a stage has no CUDA kernels.
+    """
+
+    def __init__(self, settings: Settings, refine: Any = None) -> None:
+        cost, aggregation = settings.cost, settings.aggregation
+        if not isinstance(cost, (Census, Zncc)):
+            raise DeviceError(f"cost must be census or zncc on device 'cuda', got {cost.name!r}")
+        if not isinstance(aggregation, (Sgm, Dt)):
+            raise DeviceError(f"aggregation must be sgm or dt on device 'cuda', got {aggregation.name!r}")
+        if isinstance(cost, Zncc):
+            zncc_cuda.check_window(cost)
+        self._settings = settings
+        self._refine = refine
+        self._free: dict[Any, deque[Any]] = {}
+
+    def host(self, pair: GrayPair) -> Disparity:
+        """Match a checked pair of the host.
+
+        Parameters
+        ----------
+        pair : GrayPair
+            At full size, also where it is matched at half size.
+
+        Returns
+        -------
+        Disparity
+            Of the size at which was matched, without the right view's map.
+        """
+        with self._queue(None) as queue:
+            height, width = shape = pair.left.shape
+            dtype = pair.left.dtype
+            images = queue.upload("images", np.stack([pair.left, pair.right]))
+            guide = images[: height * width] if dtype == np.uint8 else queue.upload("guide", pair.guide)
+            bad = None
+            if pair.left_bad is not None or pair.right_bad is not None:
+                none = np.zeros(shape, np.bool_)
+                masks = (none if mask is None else mask for mask in (pair.left_bad, pair.right_bad))
+                bad = queue.upload("bad", np.stack(list(masks)).view(np.uint8))
+            found, shape = self.run(queue, images, dtype, guide, bad, (height, width), pair.ranges)
+            disparity, valid = queue.fetch(found.disparity), queue.fetch(found.valid).view(np.bool_)
+            confidence = None if found.confidence is None else queue.fetch(found.confidence).reshape(shape)
+            candidates = None
+            if found.candidates is not None:
+                candidates = queue.fetch(found.candidates).reshape(2, *shape)
+        return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence, candidates=candidates)
+
+    def device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
+        """Match a pair that lies on the device, and wait for nothing.
+
+        Parameters
+        ----------
+        left, right : (H, W) or (H, W, 3) uint8, C-contiguous, with ``__cuda_array_interface__``
+            Grey or RGB; not modified.
+        stream : stream of numba, PyTorch or CuPy, int, or None
+            Where to run; None is the default stream, which waits for all others that are not made otherwise.
+
+        Raises
+        ------
+        InputError
+            If the images cannot be used.
+        DeviceError
+            If matching is at half size with a refiner that works on the host only, or memory is short.
+        """
+        if self._settings.half and self._refine is None:
+            raise DeviceError("refiner must be one with on_device for images on the device: linear, or a learned one")
+        if self._settings.half and self._settings.fill is None:
+            raise DeviceError("fill must not be None for images on the device at half size: refiners need dense maps")
+        views = _from_device("left", left), _from_device("right", right)
+        if views[0].shape != views[1].shape:
+            raise InputError(f"left and right must have the same size, got {views[0].shape} and {views[1].shape}")
+        shape = views[0].shape
+        stream = cuda.default_stream() if stream is None else stream_of(stream)
+        with self._queue(stream) as queue:
+            found = self._match_views(queue, views, False, stream)
+            if not self._settings.half:  # what refiners return is new
+                found = _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
+            other = None
+            if self._settings.right:
+                mirrored = _flat(self._match_views(queue, views[::-1], True, stream).disparity)
+                out = queue.copy(mirrored)
+                queue.launch(flip, blocks_for(out.size, flip.block), mirrored, out, *shape)
+                other = _reshaped(out, shape)
+        return DeviceDisparity(*found[:3], other)
+
+    def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _Found:
+        """Match two images on the device, or what a camera behind a mirror sees of them; at half size, refine."""
+        shape, dtype = views[0].shape, views[0].dtype
+        pixels = shape[0] * shape[1]
+        images = queue.array("images", 2 * pixels, dtype)
+        for place, image in enumerate(views):
+            take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
+        found, size = self.run(queue, images, dtype, images[:pixels], None, shape)
+        if self._settings.half:
+            disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in found[:3])
+            two = None if found.candidates is None else _reshaped(found.candidates, (2, *size))
+            coarse = DeviceDisparity(disparity, valid, sure, candidates=two)
+            return _Found(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
+        return found
+
+    @contextmanager
+    def _queue(self, stream: Any) -> Iterator[Any]:
+        """Lend a queue on `stream`; None is a stream of the queue's own."""
+        free = self._free.setdefault(None if stream is None else int(stream), deque())
+        try:
+            queue = free.pop()
+        except IndexError:
+            queue = new_queue(stream)
+        try:
+            yield queue
+        finally:
+            free.append(queue)
+
+    def run(
+        self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
+        ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
+    ) -> tuple[_Found, Shape]:  # fmt: skip
+        """Run all stages on grey images that a queue holds; return the maps and their size.
+
+        Parameters
+        ----------
+        queue : Queue
+            Where to run.
+        images : (2 * H * W,) uint8 or uint16 on the device
+            Left and right image.
+        dtype : numpy dtype
+            Their type.
+        guide : (H * W,) uint8 on the device
+            What edges are taken from.
+        bad : (2 * H * W,) uint8 on the device, or None
+            Not 0 where a pixel has no evidence.
+        shape : (int, int)
+            Height and width, pixels, before halving.
+        ranges : ((int, int), (int, int)) or None
+            As of `stereokit.costs.rows.Pair`.
+        """
+        settings = self._settings
+        if settings.half:
+            guide = halve(queue, "half.guide", guide, np.dtype(np.uint8), 1, shape, False)
+            images = halve(queue, "half.images", images, dtype, 2, shape, False)
+            if bad is not None:
+                bad = halve(queue, "half.bad", bad, np.dtype(np.uint8), 2, shape, True)
+            shape = (shape[0] + 1) // 2, (shape[1] + 1) // 2
+        height, width = shape
+        pixels = height * width
+        if settings.smooth > 0:
+            images, dtype = smooth(queue, images, dtype, settings.smooth, shape), np.dtype(np.uint16)
+        masks = queue.array("no.bad", 1, np.uint8) if bad is None else bad
+        scene = Scene(images, dtype, masks, bad is not None, height, width, settings.levels, settings.outside, ranges)
+        if pixels * scene.padded >= 2**34:
+            raise DeviceError(
+                f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * scene.padded}"
+            )
+        confidence = queue.array("match.confidence", (0, 1, 3)[settings.confidence] * pixels or 1, np.float32)
+        maps = Maps(
+            queue.array("match.disparity", pixels, np.float32),
+            queue.array("match.cost", pixels, np.uint16 if not _floats(settings.aggregation) else np.float32),
+            confidence,
+            settings.levels.count,
+            settings.levels.minimum,
+            int(settings.subpixel),
+            np.float32(settings.uniqueness / 100),
+            settings.confidence,
+        )
+        _aggregate(queue, settings, scene, guide, maps)
+        candidates = None
+        if settings.confidence > 1:
+            confidence, candidates = confidence[:pixels], confidence[pixels:]
+        chain = Chain(
+            settings.smp, int(settings.speckle * pixels), settings.fill, settings.median, settings.levels.minimum
+        )
+        left_bad = None if bad is None else bad[:pixels]
+        disparity, valid = post_process(queue, maps.disparity, maps.cost, left_bad, chain, shape)
+        if not settings.confidence:
+            return _Found(disparity, valid), shape
+        queue.launch(doubt, blocks_for(pixels, doubt.block), confidence, valid, pixels)
+        return _Found(disparity, valid, confidence, candidates), shape
+
+
+def _floats(aggregation: Any) -> bool:
+    """Return whether aggregated costs are floats."""
+    return bool(np.dtype(aggregation.total_dtype).kind == "f")
+
+
+def _aggregate(queue: Queue, settings: Settings, scene: Scene, guide: Any, maps: Maps) -> None:
+    """Compute the costs, aggregate them and select."""
+    cost, aggregation = settings.cost, settings.aggregation
+    shape = scene.height, scene.width
+    if isinstance(cost, Census):
+        volume = census_cuda.volume(queue, cost, scene)
+    else:
+        assert isinstance(cost, Zncc)
+        volume = zncc_cuda.volume(queue, cost, scene)
+    if isinstance(aggregation, Sgm):
+        aggregate_sgm(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)
+        return
+    aggregate_dt(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)

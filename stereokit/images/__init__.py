@@ -1,0 +1,1 @@
+"""Images on the way in: checks, grey, half size."""

@@ -115,19 +115,35 @@ def sheet(width: float, height: float, bend: float = 0.0, wave: float = 0.0, wav
     return grid(points, _coordinates(u, v))
 
 
+def _cube() -> tuple[Float, Float, NDArray[np.int64], NDArray[np.int32]]:
+    """Return a cube of side 1: corners and normals (24, 3), the axes across and down of each, and the faces (12, 3)."""
+    corners, normals, axes, faces = [], [], [], []
+    for side in range(6):
+        out, sign = side // 2, 1.0 - 2 * (side % 2)
+        across, down = ((2, 1), (0, 2), (0, 1))[out]
+        for v in (-0.5, 0.5):
+            for u in (-0.5, 0.5):
+                corner, normal = np.zeros(3), np.zeros(3)
+                corner[across], corner[down], corner[out], normal[out] = u, v, 0.5 * sign, sign
+                corners.append(corner)
+                normals.append(normal)
+                axes.append((across, down))
+        faces += [(4 * side, 4 * side + 1, 4 * side + 2), (4 * side + 1, 4 * side + 3, 4 * side + 2)]
+    return np.array(corners), np.array(normals), np.array(axes), np.array(faces, np.int32)
+
+
+_CUBE = _cube()
+
+
 def box(width: float, height: float, depth: float) -> Mesh:
     """Return a box, centred; each side has its own coordinates."""
-    sides = []
-    quarter = np.pi / 2
-    for yaw, pitch, w, h, d in (
-        (0.0, 0.0, width, height, depth), (2 * quarter, 0.0, width, height, depth),
-        (quarter, 0.0, depth, height, width), (-quarter, 0.0, depth, height, width),
-        (0.0, quarter, width, depth, height), (0.0, -quarter, width, depth, height),
-    ):  # fmt: skip
-        side = sheet(w, h).moved(None, (0.0, 0.0, -d / 2)).moved(rotation(yaw, pitch))
-        offset = len(sides) * 0.37
-        sides.append(Mesh(side.points, side.normals, side.uv + np.array([offset, offset, 0, 0]), side.faces))
-    return merge(sides)
+    corners, normals, axes, faces = _CUBE
+    size = np.array([width, height, depth])
+    points = corners * size
+    uv = np.empty((24, 4))
+    uv[:, :2] = np.take_along_axis(points, axes, axis=1) + 0.37 * np.repeat(np.arange(6), 4)[:, None]
+    uv[:, 2:] = np.take_along_axis(corners, axes, axis=1) + 0.5
+    return Mesh(points, normals, uv, faces)
 
 
 def lathe(radii: Float, heights: Float, steps: int = 48, squash: float = 1.0, share: float = 1.0) -> Mesh:

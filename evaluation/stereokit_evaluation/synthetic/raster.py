@@ -25,7 +25,7 @@ MASK_SIZE = 256
 _NEAR = 1e-6
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def edge_functions(points: Float, faces: NDArray[np.int32]) -> Float:
     """Return the edge functions of every triangle.
 
@@ -57,7 +57,7 @@ def edge_functions(points: Float, faces: NDArray[np.int32]) -> Float:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _rows(points: Float, face: Any, focal: float, cy: float, y0: float, dy: float, count: int) -> tuple[int, int]:
     """Return the first and last + 1 of the rows ``y0 + k * dy`` that a triangle may touch."""
     low, high = 1e300, -1e300
@@ -72,7 +72,7 @@ def _rows(points: Float, face: Any, focal: float, cy: float, y0: float, dy: floa
     return int(first), int(last) + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _span(edges: Any, py: float) -> tuple[float, float]:
     """Return the interval of `x` on the row `py` that a triangle covers, both in units of the focal length."""
     low, high = -1e300, 1e300
@@ -87,7 +87,7 @@ def _span(edges: Any, py: float) -> tuple[float, float]:
     return low, high
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cut(uv: Float, face: Any, e0: float, e1: float, e2: float, mask: Any) -> bool:
     """Return whether a cut-out mask has a hole at a point, given by its weights at the corners."""
     total = e0 + e1 + e2
@@ -98,7 +98,7 @@ def _cut(uv: Float, face: Any, e0: float, e1: float, e2: float, mask: Any) -> bo
     return bool(mask[row, column] == 0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def visible(
     points: Float, faces: NDArray[np.int32], edges: Float, uv: Float, face_mask: NDArray[np.int32],
     masks: NDArray[np.uint8], focal: float, cx: float, cy: float,
@@ -132,6 +132,7 @@ def visible(
     """
     shown = np.full((rows, columns), -1, np.int32)
     inverse = np.zeros((rows, columns))
+    rays = (x0 + dx * np.arange(columns) - cx) / focal
     for m in range(faces.shape[0]):
         e = edges[m]
         scale = e[9]
@@ -148,7 +149,7 @@ def visible(
             right = max(-1.0, min(float(columns - 1), np.floor((cx + focal * high - x0) / dx + 1e-6)))
             c0, c1, c2 = e[1] * py + e[2], e[4] * py + e[5], e[7] * py + e[8]
             for k in range(int(left), int(right) + 1):
-                px = (x0 + k * dx - cx) / focal
+                px = rays[k]
                 e0, e1, e2 = e[0] * px + c0, e[3] * px + c1, e[6] * px + c2
                 if e0 < 0 or e1 < 0 or e2 < 0:
                     continue
@@ -161,7 +162,7 @@ def visible(
     return shown, inverse
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def hidden(
     points: Float, faces: NDArray[np.int32], edges: Float, uv: Float, face_mask: NDArray[np.int32],
     masks: NDArray[np.uint8], focal: float, cx: float, cy: float, x: Float, inverse: Float, slack: float,

@@ -69,7 +69,7 @@ def draw_sensors(rng: Rng, harsh: float) -> tuple[Sensor, Sensor]:
     contrast = float(np.clip(np.exp(rng.normal(0.0, 0.15)), 0.4, 1.3)) * (rng.uniform(0.35, 0.8) if rng.random() < 0.15 else 1)
     black = float(rng.uniform(0, 14 + 20 * (1 - min(contrast, 1.0))))
     quality = int(rng.integers(72, 98)) if rng.random() < 0.25 + 0.2 * harsh else 0
-    defocus = float(rng.uniform(0.003, 0.02)) if rng.random() < 0.15 + 0.2 * harsh else 0.0
+    defocus = float(rng.uniform(0.003, 0.02)) if rng.random() < 0.08 + 0.12 * harsh else 0.0
     focus = float(rng.uniform(0.1, 0.9))
     differ = 0.25 + 0.75 * harsh
     pair = []
@@ -99,7 +99,7 @@ def _weights(deviation: float) -> NDArray[np.float64]:
     return np.asarray(w / w.sum())
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _blurred(image: Any, w: Any) -> Any:
     """Return the image (h, w) float64 after a separable filter; the border is repeated."""
     rows, columns = image.shape

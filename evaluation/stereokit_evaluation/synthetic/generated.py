@@ -14,7 +14,7 @@ from stereokit_evaluation.synthetic.closeups import closeup
 from stereokit_evaluation.synthetic.objects import flying, pile
 from stereokit_evaluation.synthetic.outdoor import garden, road
 from stereokit_evaluation.synthetic.render import Rendered, Rig, render
-from stereokit_evaluation.synthetic.rooms import room
+from stereokit_evaluation.synthetic.rooms import hall, room
 from stereokit_evaluation.synthetic.sensors import Sensor, draw_sensors, expose
 from stereokit_evaluation.synthetic.stage import Stage
 from stereokit_evaluation.synthetic.terrain import terrain
@@ -24,7 +24,7 @@ __all__ = ["KINDS", "GeneratedPair", "generate_pair"]
 Rng = np.random.Generator
 
 KINDS: dict[str, Callable[[Stage], None]] = {
-    "flying": flying, "pile": pile, "room": room, "terrain": terrain, "closeup": closeup, "road": road, "garden": garden,
+    "flying": flying, "pile": pile, "room": room, "hall": hall, "terrain": terrain, "closeup": closeup, "road": road, "garden": garden,
 }  # fmt: skip
 _SIZES = ((640, 384), (640, 480), (720, 480), (768, 432), (800, 448), (832, 384), (960, 384), (960, 544))
 
@@ -71,8 +71,8 @@ def generate_pair(seed: int, kind: str) -> GeneratedPair:
     world, camera, noise = (np.random.default_rng([seed, number, part]) for part in range(3))
     width, height = _SIZES[int(camera.integers(len(_SIZES)))]
     largest = float(np.exp(camera.uniform(np.log(12), np.log(200))))
-    harsh = float(camera.beta(1.1, 2.6))
-    crooked = camera.random() < 0.4
+    harsh = float(camera.beta(1.1, 2.6)) if kind != "terrain" else float(camera.beta(2.0, 1.6))
+    crooked = camera.random() < (0.4 if kind != "terrain" else 0.7)
     left, right = draw_sensors(camera, harsh)
     rig = Rig(
         width, height, min(largest, width / 4), float(camera.uniform(0.5, 6)),

@@ -31,7 +31,7 @@ def studio_light(stage: Stage) -> None:
 def flying(stage: Stage) -> None:
     """Fill `stage` with things at all depths before a wall or two; some air is empty."""
     rng = stage.rng
-    stage.plain = float(rng.choice([0.03, 0.12, 0.3], p=[0.4, 0.4, 0.2]))
+    stage.plain = float(rng.choice([0.02, 0.1, 0.25], p=[0.5, 0.35, 0.15]))
     stage.field_of_view = float(rng.uniform(0.6, 1.4))
     stage.look(0, float(rng.normal(0, 0.1)), float(rng.normal(0, 0.1)))
     studio_light(stage)

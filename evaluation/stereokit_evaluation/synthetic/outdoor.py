@@ -26,7 +26,7 @@ def daylight(stage: Stage, reach: float) -> None:
         "ambient": float(rng.uniform(0.2, 0.5)) if sunny else float(rng.uniform(0.6, 0.9)),
         "sky_low": sky, "sky_high": sky * float(rng.uniform(0.35, 1.0)), "clouds": float(rng.choice([0.0, 0.2, 0.8])) * sky,
         "around": stage.slot(str(rng.choice(["fractal", "facade", "photograph", "speckle"]))),
-        "around_level": float(rng.integers(2, 6)), "around_gain": float(rng.uniform(0.6, 1.8)),
+        "around_level": float(rng.integers(1, 5)), "around_gain": float(rng.uniform(0.6, 1.8)),
         "fog": float(rng.choice([0.0, 0.002, 0.008, 0.02], p=[0.4, 0.3, 0.2, 0.1])), "fog_brightness": 0.6 * sky,
     }  # fmt: skip
     if sunny:
@@ -42,7 +42,7 @@ def car(stage: Stage, at: Float, yaw: float) -> None:
                        gloss=float(rng.uniform(0.2, 1.0)), sharpness=int(rng.integers(4, 8)),
                        mirror=float(rng.choice([0.0, 0.05, 0.2])))  # fmt: skip
     pane = stage.paint("collage", 1.0, 0.05, float(rng.choice([0.0, 0.12])), plain=False, detail=None, gloss=0.5, sharpness=7,
-                       mirror=float(rng.uniform(0.1, 0.7)))  # fmt: skip
+                       mirror=float(rng.uniform(0.1, 0.7)), clear=float(rng.choice([0.0, rng.uniform(0.3, 0.8)])))  # fmt: skip
     low, waist = height * 0.18, height * 0.58
     body = blob(1.0, power=0.32, steps=20)
     stage.add(body, coat, None, turn @ np.diag([width / 2, (waist - low) / 2, length / 2]), at + np.array([0, -(waist + low) / 2, 0]))
@@ -56,6 +56,12 @@ def car(stage: Stage, at: Float, yaw: float) -> None:
             post = turn @ np.array([sx * width * 0.42, -(waist + height) / 2, k * length * roof * 2])
             lean = rotation(0, float(np.sign(k)) * 0.35)
             stage.add(box(0.07, (height - waist) * 1.05, 0.09), coat, None, turn @ lean, at + post + shift)
+    seat = stage.paint(size=1.0, albedo=float(rng.uniform(0.02, 0.3)))
+    for sx in (-0.22, 0.22):
+        for k in (-0.2, 0.15):
+            chair = turn @ np.array([sx * width, -waist - 0.12, k * length * roof * 2])
+            stage.add(box(0.5, 0.6, 0.15), seat, None, turn, at + chair + shift)
+            stage.add(box(0.25, 0.22, 0.1), seat, None, turn, at + chair + shift - [0, 0.42, 0])
     tyre = stage.paint("fractal", 0.5, 0.05, 0.05, plain=False)
     rim = stage.paint("collage", 0.8, 0.5, 0.6, plain=False)
     radius = height * 0.2
@@ -149,15 +155,15 @@ def _pole(stage: Stage, at: Float) -> None:
 def road(stage: Stage) -> None:
     """Fill `stage` with a road between fronts, trees, fences and cars."""
     rng = stage.rng
-    stage.plain = float(rng.choice([0.1, 0.25, 0.45]))
+    stage.plain = float(rng.choice([0.05, 0.15, 0.35]))
     stage.field_of_view = float(rng.uniform(0.6, 1.5))
     eye = float(rng.uniform(1.1, 2.4))
     stage.place = np.array([0.0, -eye, 0.0])
-    stage.look(float(rng.normal(0, 0.15)), float(rng.normal(-0.02, 0.06)), float(rng.normal(0, 0.01)))
+    stage.look(float(rng.normal(0, 0.15)), float(rng.normal(-0.07, 0.07)), float(rng.normal(0, 0.01)))
     daylight(stage, float(rng.uniform(14, 40)))
     weak = rng.random() < 0.6
     asphalt = stage.paint(str(rng.choice(["fractal", "speckle", "cells"])), float(rng.uniform(0.5, 4)), float(rng.uniform(0.15, 0.5)),
-                          float(rng.uniform(0.03, 0.25)) if weak else float(rng.uniform(0.2, 0.6)), plain=False)  # fmt: skip
+                          float(rng.uniform(0.08, 0.3)) if weak else float(rng.uniform(0.25, 0.7)), plain=False)  # fmt: skip
     verge = stage.paint(str(rng.choice(["strokes", "fractal", "tiles", "cells"])), float(rng.uniform(0.8, 3)), float(rng.uniform(0.15, 0.6)))
     half = float(rng.uniform(2.5, 6))
     for side in (-1, 1):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stereokit_evaluation.synthetic.meshes import Mesh
 from stereokit_evaluation.synthetic.raster import edge_functions, hidden, visible
 from stereokit_evaluation.synthetic.sensors import Sensor, expose
-from stereokit_evaluation.synthetic.shading import shade
+from stereokit_evaluation.synthetic.shading import LIGHT, MATERIAL, shade
 from stereokit_evaluation.synthetic.stage import Stage, Triangles
 
 __all__ = ["Rendered", "Rig", "render"]
@@ -119,27 +119,41 @@ def render(stage: Stage, rig: Rig, noise: np.random.Generator) -> Rendered:
     np.put_along_axis(seen, order, ~covered, axis=1)
     seen &= x >= 0
 
-    light = stage.lights()
-    light[21] = 4 * stage.shadows / _SHADOW_SIDE
-    shadow, sun_turn, sun_focal = np.zeros((1, 1)), np.zeros((3, 4)), 1.0
-    if stage.shadows > 0 and light[3] > 0:
-        shadow, sun_turn, sun_focal = _shadows(scene, stage, light[:3])
     cosine, sine = float(np.cos(rig.roll)), float(np.sin(rig.roll))
     roll = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     pictures = []
     gain = 0.0
+    opaque = scene.materials[scene.material, MATERIAL.index("clear")] == 0
     for right in (False, True):
+        if not right or stage.later:
+            light = stage.lights(right=right)
+            light[LIGHT.index("shadow_bias")] = 4 * stage.shadows / _SHADOW_SIDE
+            shadow, sun_turn, sun_focal = np.zeros((1, 1)), np.zeros((3, 4)), 1.0
+            if stage.shadows > 0 and light[LIGHT.index("sun")] > 0:
+                shadow, sun_turn, sun_focal = _shadows(scene, stage, light[:3])
         points = moved @ roll.T if right else mesh.points
         view = Mesh(points, mesh.normals, mesh.uv, mesh.faces)
         own = edge_functions(points, mesh.faces) if right else edges
         middle_x, middle = (cx + shift, cy + rig.lift) if right else (cx, cy)
         place = (-0.25, 0.5, 2 * width, -0.25, 0.5, 2 * height)
         shown, near = visible(view.points, view.faces, own, *fixed, focal, middle_x, middle, *place)
-        bright = shade(
-            shown, near, own, view.faces, view.uv, view.normals, scene.material, scene.materials, scene.bank, light,
-            shadow, sun_turn, sun_focal, focal, middle_x, middle, -0.25, 0.5, -0.25, 0.5,
+        rest = (
+            scene.materials, scene.bank, light, shadow, sun_turn, sun_focal,
+            focal, middle_x, middle, -0.25, 0.5, -0.25, 0.5,
             baseline if right else 0.0, cosine if right else 1.0, sine if right else 0.0,
         )  # fmt: skip
+        behind = np.zeros((1, 1), np.float32)
+        if not opaque.all():
+            through, deep = visible(
+                view.points, view.faces[opaque], own[opaque], mesh.uv, scene.mask[opaque], scene.masks,
+                focal, middle_x, middle, *place,
+            )  # fmt: skip
+            panes = (shown >= 0) & ~opaque[np.maximum(shown, 0)]
+            behind = shade(
+                np.where(panes, through, -2).astype(np.int32), deep, own[opaque], view.faces[opaque], view.uv, view.normals,
+                scene.material[opaque], *rest, behind,
+            )  # fmt: skip
+        bright = shade(shown, near, own, view.faces, view.uv, view.normals, scene.material, *rest, behind)
         gain = gain or 1 / max(float(np.minimum(bright, 1.5).mean()), 1e-3)
         pictures.append(expose(bright * np.float32(gain), np.maximum(near * focal * baseline - shift, 0.0), rig.right if right else rig.left, noise))
     return Rendered(pictures[0], pictures[1], disparity.astype(np.float32), seen)

@@ -17,6 +17,7 @@ Float = NDArray[np.float64]
 MATERIAL = (
     "texture", "turn_x", "turn_y", "shift_x", "shift_y", "albedo", "contrast",
     "detail", "detail_x", "detail_y", "detail_contrast", "gloss", "sharpness", "mirror", "emission",
+    "clear",
 )  # fmt: skip
 """Columns of a material: slots of its two textures, repeats per metre along their axes, and what they do."""
 
@@ -98,7 +99,7 @@ def shade(
     face_material: NDArray[np.int32], materials: Float, bank: NDArray[np.uint8], light: Float,
     shadow: Float, sun_turn: Float, sun_focal: float,
     focal: float, cx: float, cy: float, x0: float, dx: float, y0: float, dy: float,
-    baseline: float, roll_cos: float, roll_sin: float,
+    baseline: float, roll_cos: float, roll_sin: float, behind: NDArray[np.float32],
 ) -> NDArray[np.float32]:  # fmt: skip
     """Return the brightness of every sample of a view.
 
@@ -120,11 +121,13 @@ def shade(
         Camera and positions of the samples, as for `raster.visible`.
     baseline, roll_cos, roll_sin : float
         Where this camera is from the left one, and how it is turned about its axis.
+    behind : (R, C) float32
+        What is seen through panes; (1, 1) where there are none.
 
     Returns
     -------
     (R, C) float32
-        About 0..1; above 1 is brighter than white.
+        0 where `shown` is below -1, else about 0..1; above 1 is brighter than white.
     """
     rows, columns = shown.shape
     out = np.empty((rows, columns), np.float32)
@@ -132,6 +135,9 @@ def shade(
         py = (y0 + r * dy - cy) / focal
         for k in range(columns):
             m = shown[r, k]
+            if m < -1:
+                out[r, k] = 0
+                continue
             beside = k + 1 if r % 2 else k - 1
             if r % 2 != k % 2 and 0 <= beside < columns and shown[r, beside] == m:
                 continue  # two of a pixel's four samples do where it shows one triangle: see below
@@ -224,6 +230,8 @@ def shade(
                 graze = graze * graze * graze * graze * graze
                 share = mat[13] + (1 - mat[13]) * graze * 0.6
                 value = value * (1 - share) + share * _around(bank, light, rx, ry, rz)
+            if mat[15] > 0:
+                value += mat[15] * behind[r, k]
             if light[19] > 0:
                 clear = np.exp(-z * light[19])
                 value = value * clear + light[20] * (1 - clear)

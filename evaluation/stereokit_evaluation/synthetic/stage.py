@@ -51,6 +51,8 @@ class Stage:
         Half the side of the region that the sun's shadows cover, metres; 0 for none.
     shadow_centre : (3,) float64
         Its middle.
+    later : dict
+        What differs in the light when the right view is taken.
     offset : bool
         Shift the right view so that the smallest disparity is small, as rectified pictures of a far scene are.
     base_ratio : float
@@ -65,6 +67,7 @@ class Stage:
     light: dict[str, float] = field(default_factory=dict)
     shadows: float = 0.0
     shadow_centre: Float = field(default_factory=lambda: np.array([0.0, 0.0, 5.0]))
+    later: dict[str, float] = field(default_factory=dict)
     offset: bool = False
     base_ratio: float = 0.4
     _parts: list[tuple[Mesh, int, int]] = field(default_factory=list)
@@ -98,6 +101,7 @@ class Stage:
         sharpness: int = 5,
         mirror: float = 0.0,
         emission: float = 0.0,
+        clear: float = 0.0,
         plain: bool | None = None,
         turned: bool = False,
     ) -> int:
@@ -117,6 +121,8 @@ class Stage:
             Share of the surroundings that it mirrors when seen from the front.
         emission : float
             Light of its own.
+        clear : float
+            Share of the light behind it that it lets through.
         plain : bool
             Without texture; drawn from the stage's share if it is not given.
         turned : bool
@@ -129,16 +135,16 @@ class Stage:
         angle = rng.uniform(0, 2 * np.pi) if turned else rng.choice([0.0, np.pi / 2]) + rng.normal(0, 0.01)
         row[:5] = self.slot(kind), np.cos(angle) / size, np.sin(angle) / size, *rng.random(2)
         row[5] = rng.uniform(0.12, 0.85) if albedo is None else albedo
-        row[6] = min(np.exp(rng.uniform(np.log(0.25), np.log(1.6))), 1.6 * row[5] + 0.1) if contrast is None else contrast
+        row[6] = min(np.exp(rng.uniform(np.log(0.35), np.log(2.0))), 1.6 * row[5] + 0.1) if contrast is None else contrast
         if detail is not None:
             fine = size * np.exp(rng.uniform(-2.2, -0.3)) if detail_size is None else detail_size
             turn = rng.uniform(0, 2 * np.pi)
             row[7:10] = self.slot(detail), np.cos(turn) / fine, np.sin(turn) / fine
-            row[10] = np.exp(rng.uniform(np.log(0.03), np.log(0.4))) if detail_contrast is None else detail_contrast
+            row[10] = np.exp(rng.uniform(np.log(0.05), np.log(0.6))) if detail_contrast is None else detail_contrast
         if plain:
             row[6] *= rng.choice([0.0, 0.03, 0.08])
             row[10] *= rng.choice([0.0, 0.04, 0.12])
-        row[11:] = gloss, sharpness, mirror, emission
+        row[11:] = gloss, sharpness, mirror, emission, clear
         self._materials.append(row)
         return len(self._materials) - 1
 
@@ -167,9 +173,10 @@ class Stage:
             bank=np.concatenate([pyramid(*key) for key in self._textures]),
         )
 
-    def lights(self) -> Float:
+    def lights(self, *, right: bool = False) -> Float:
         """Return the light as `shading.shade` takes it, directions turned into the camera's axes."""
-        row = np.array([self.light.get(name, 0.0) for name in LIGHT])
+        light = self.light | self.later if right else self.light
+        row = np.array([light.get(name, 0.0) for name in LIGHT])
         sun = row[:3] / max(float(np.sqrt((row[:3] ** 2).sum())), 1e-12)
         row[:3] = sun @ self.turn
         row[5:8] = np.array([0.0, -1.0, 0.0]) @ self.turn

@@ -75,7 +75,7 @@ def terrain(stage: Stage) -> None:
         roofs = [stage.paint(str(rng.choice(["tiles", "stripes", "fractal", "facade", "speckle"])), float(rng.uniform(3, 12)),
                              float(rng.uniform(0.15, 0.85)), gloss=float(rng.choice([0, 0.4]))) for _ in range(8)]  # fmt: skip
         walls = [stage.paint("facade", float(rng.uniform(4, 12))) for _ in range(4)]
-        tall = float(np.exp(rng.uniform(np.log(1.0), np.log(9))))
+        tall = float(np.exp(rng.uniform(np.log(1.0), np.log(14))))
         for _ in range(int(rng.integers(20, 160))):
             cell = (rng.integers(-4, 5, 2) + 0.5) * pitch + rng.uniform(-0.3, 0.3, 2) * pitch
             w, d = pitch * rng.uniform(0.12, 0.6, 2)
@@ -104,7 +104,7 @@ def terrain(stage: Stage) -> None:
         crowns.append(blob(radius, rng.uniform(-0.15, 0.15, (9, 17)), steps=8).moved(rotation(float(rng.uniform(0, 6))), tuple(at)))
     if crowns:
         stage.add(merge(crowns), leaves)
-    count = int(rng.integers(0, 60))
+    count = int(rng.integers(0, 90))
     if count:  # cars and sheds
         places = rng.uniform(-60, 60, (count, 2))
         heights = np.array([-ground(x, z) - 0.3 for x, z in places])
@@ -117,5 +117,9 @@ def terrain(stage: Stage) -> None:
         "sun_z": float(rng.normal(0, 1)), "ambient": float(rng.uniform(0.15, 0.6)),
         "around": stage.slot("fractal"), "around_level": 3.0, "around_gain": 1.0,
     }  # fmt: skip
+    if rng.random() < 0.6:  # taken at another time
+        amount = float(rng.choice([0.05, 0.3, 0.8]))
+        stage.later = {f"sun_{axis}": stage.light[f"sun_{axis}"] + float(rng.normal(0, amount)) for axis in "xz"}
+        stage.later["sun"] = stage.light["sun"] * float(np.exp(rng.normal(0, 0.3)))
     if rng.random() < 0.85:
         stage.shadows, stage.shadow_centre = 80.0, np.zeros(3)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stereokit_evaluation.synthetic.meshes import blob, box, cards, lathe, rotation, sheet, tube
 from stereokit_evaluation.synthetic.stage import Stage
 
-__all__ = ["CUTS", "SOLIDS", "bookshelf", "chair", "lamp", "plant", "solid", "sticks", "table", "tree", "wire"]
+__all__ = ["CUTS", "SOLIDS", "bookshelf", "chair", "fur", "lamp", "plant", "solid", "sticks", "table", "tree", "wire"]
 
 Float = NDArray[np.float64]
 
@@ -229,8 +229,22 @@ def bookshelf(stage: Stage, width: float, height: float, at: Float, yaw: float) 
             x += thick * 1.03
 
 
+def fur(stage: Stage, size: float, at: Float, turn: Float) -> None:
+    """Add a hairy ball: tufts of blades all over it."""
+    rng = stage.rng
+    count = int(rng.integers(150, 700))
+    coat = stage.paint(str(rng.choice(["strokes", "fractal"])), size * 0.2, gloss=float(rng.choice([0.0, 0.4])), plain=False)
+    stage.add(blob(size * 0.42, steps=16), coat, None, turn, at)
+    out = rng.normal(0, 1, (count, 3))
+    out /= np.sqrt((out * out).sum(axis=1, keepdims=True))
+    pitch, yaw = -np.arcsin(np.clip(out[:, 1], -1, 1)) - np.pi / 2, np.arctan2(out[:, 0], out[:, 2])
+    turns = np.stack([yaw, pitch, rng.uniform(-3, 3, count)], axis=1) + rng.normal(0, 0.25, (count, 3))
+    length = size * rng.uniform(0.1, 0.3)
+    stage.add(cards(out * (size * 0.42 + length * 0.3), turns, length * rng.uniform(0.6, 1.2, (count, 2))), coat, "blades", turn, at)
+
+
 SOLIDS: tuple[Callable[[Stage, float, Float, Float], None], ...] = (
-    _box, _ball, _lump, _vase, _can, _paper, _paper, _ring, sticks, plant,
+    _box, _ball, _lump, _vase, _can, _paper, _paper, _ring, sticks, plant, fur,
 )  # fmt: skip
 """Makers of loose things: called with the stage, a size, a place, and a turn."""
 

@@ -24,11 +24,18 @@ def closeup(stage: Stage) -> None:
     def skin() -> int:
         """Return a material: cloudy, with vessels or pores, mostly wet."""
         kind = str(rng.choice(["vessels", "fractal", "speckle", "cells", "photograph"], p=[0.5, 0.25, 0.1, 0.1, 0.05]))
-        return stage.paint(kind, float(rng.uniform(4, 16)), float(rng.uniform(0.25, 0.7)),
-                           float(np.exp(rng.uniform(np.log(0.06), np.log(0.7)))), detail_size=float(rng.uniform(0.8, 4)),
-                           detail_contrast=float(np.exp(rng.uniform(np.log(0.015), np.log(0.15)))),
-                           gloss=float(rng.uniform(0.3, 2.5)) if wet else 0.0, sharpness=int(rng.integers(4, 9)),
-                           plain=False, turned=True)  # fmt: skip
+        return stage.paint(
+            kind,
+            float(rng.uniform(4, 16)),
+            float(rng.uniform(0.25, 0.7)),
+            float(np.exp(rng.uniform(np.log(0.06), np.log(0.7)))),
+            detail_size=float(rng.uniform(0.8, 4)),
+            detail_contrast=float(np.exp(rng.uniform(np.log(0.015), np.log(0.15)))),
+            gloss=float(rng.uniform(0.3, 2.5)) if wet else 0.0,
+            sharpness=int(rng.integers(4, 9)),
+            plain=False,
+            turned=True,
+        )
 
     kind = rng.random()
     if kind < 0.3:  # inside a tube with folds
@@ -53,19 +60,29 @@ def closeup(stage: Stage) -> None:
     else:
         side = 160
         field = relief(rng, side, float(rng.uniform(1.8, 3.0)), float(rng.uniform(1, 3)))
-        height = field * float(rng.uniform(0.3, 1.6)) + relief(rng, side, 1.2, 12.0) * float(rng.choice([0.0, 0.02, 0.06]))
+        height = field * float(rng.uniform(0.3, 1.6)) + relief(rng, side, 1.2, 12.0) * float(
+            rng.choice([0.0, 0.02, 0.06])
+        )
         base = heightfield(height, half * 5, half * 5).moved(None, (0, 0, -half * 2.5))
         stand = rotation(float(rng.normal(0, 0.4)), np.pi / 2 + float(rng.normal(0, 0.5)), float(rng.normal(0, 0.5)))
         stage.add(base, skin(), None, stand, (0, 0, 12.0))
         for _ in range(int(rng.integers(0, 9))):
             radius = float(rng.uniform(0.08, 0.5)) * half
             z = float(rng.uniform(5.5, 12))
-            at = (rng.uniform(-1, 1) * half * z / 10, rng.uniform(-0.8, 0.8) * half * z / 10, z)
+            spot = np.array([rng.uniform(-1, 1) * half * z / 10, rng.uniform(-0.8, 0.8) * half * z / 10, z])
             mesh = blob(radius, bumps(rng, 48, float(rng.uniform(0.05, 0.35))), steps=48)
-            stage.add(mesh, skin(), None, rotation(*rng.uniform(-3, 3, 3)) * np.exp(rng.uniform(-0.5, 0.3, 3)), at)
+            stage.add(mesh, skin(), None, rotation(*rng.uniform(-3, 3, 3)) * np.exp(rng.uniform(-0.5, 0.3, 3)), spot)
     for _ in range(int(rng.choice([0, 1, 2, 3], p=[0.4, 0.3, 0.2, 0.1]))):  # instruments
-        metal = stage.paint("strokes", 3.0, float(rng.uniform(0.1, 0.6)), 0.15, gloss=1.5, sharpness=5,
-                            mirror=float(rng.choice([0.0, 0.4])), plain=bool(rng.random() < 0.5))  # fmt: skip
+        metal = stage.paint(
+            "strokes",
+            3.0,
+            float(rng.uniform(0.1, 0.6)),
+            0.15,
+            gloss=1.5,
+            sharpness=5,
+            mirror=float(rng.choice([0.0, 0.4])),
+            plain=bool(rng.random() < 0.5),
+        )
         tip = np.array([rng.uniform(-0.5, 0.5) * half * 0.8, rng.uniform(-0.4, 0.4) * half * 0.8, rng.uniform(6, 9)])
         side_x = float(rng.choice([-1, 1]))
         end = np.array([side_x * half * 1.3, rng.uniform(-0.2, 1.0) * half, rng.uniform(3.0, 5.5)])
@@ -80,8 +97,13 @@ def closeup(stage: Stage) -> None:
         path = (1 - t) * a + t * b + np.sin(t * rng.uniform(2, 9) + rng.normal(size=3)) * rng.uniform(0, 0.8)
         stage.add(tube(path, float(rng.uniform(0.02, 0.08)), 6), stage.paint(plain=True, gloss=0.5))
     stage.light = {
-        "lamp": float(rng.uniform(60, 140)), "lamp_x": float(rng.normal(0, 0.8)), "lamp_y": float(rng.normal(0, 0.8)),
-        "lamp_z": float(rng.uniform(-1.5, 0.5)), "ambient": float(rng.uniform(0.02, 0.3)),
-        "around": stage.slot("fractal"), "around_level": 3.0, "around_gain": 0.8,
-    }  # fmt: skip
+        "lamp": float(rng.uniform(60, 140)),
+        "lamp_x": float(rng.normal(0, 0.8)),
+        "lamp_y": float(rng.normal(0, 0.8)),
+        "lamp_z": float(rng.uniform(-1.5, 0.5)),
+        "ambient": float(rng.uniform(0.02, 0.3)),
+        "around": stage.slot("fractal"),
+        "around_level": 3.0,
+        "around_gain": 0.8,
+    }
     stage.offset = bool(rng.random() < 0.3)

@@ -13,8 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "Mesh", "blob", "box", "cards", "grid", "heightfield", "lathe", "merge", "prism", "rotation", "sheet", "tube",
-]  # fmt: skip
+    "Mesh",
+    "blob",
+    "box",
+    "cards",
+    "grid",
+    "heightfield",
+    "lathe",
+    "merge",
+    "prism",
+    "rotation",
+    "sheet",
+    "tube",
+]
 
 Float = NDArray[np.float64]
 
@@ -97,7 +108,9 @@ def _coordinates(u: Float, v: Float) -> Float:
     return np.stack([across, down, s, t], axis=-1)
 
 
-def sheet(width: float, height: float, bend: float = 0.0, wave: float = 0.0, waves: float = 1.0, steps: int = 1) -> Mesh:
+def sheet(
+    width: float, height: float, bend: float = 0.0, wave: float = 0.0, waves: float = 1.0, steps: int = 1
+) -> Mesh:
     """Return an upright sheet that faces the camera, centred; bent into an arc of `bend` radians, or waved.
 
     `wave` is the height of `waves` sine waves across, metres.

@@ -39,14 +39,28 @@ def flying(stage: Stage) -> None:
     half = far * np.tan(stage.field_of_view / 2)
     if rng.random() < 0.9:
         bend = float(rng.normal(0, 0.5)) if rng.random() < 0.4 else 0.0
-        stage.add(sheet(half * 6, half * 5, bend, 0.0, 1.0, 40 if bend else 1), stage.paint(size=half * rng.uniform(0.3, 2.5)),
-                  None, rotation(float(rng.normal(0, 0.35)), float(rng.normal(0, 0.25))), (0, 0, far))  # fmt: skip
+        stage.add(
+            sheet(half * 6, half * 5, bend, 0.0, 1.0, 40 if bend else 1),
+            stage.paint(size=half * rng.uniform(0.3, 2.5)),
+            None,
+            rotation(float(rng.normal(0, 0.35)), float(rng.normal(0, 0.25))),
+            (0, 0, far),
+        )
     else:
-        stage.light |= {"sky_low": rng.uniform(0.4, 1.2), "sky_high": rng.uniform(0.2, 1.0), "clouds": rng.uniform(0, 0.5)}
+        stage.light |= {
+            "sky_low": rng.uniform(0.4, 1.2),
+            "sky_high": rng.uniform(0.2, 1.0),
+            "clouds": rng.uniform(0, 0.5),
+        }
     if rng.random() < 0.6:
         floor = heightfield(np.zeros((2, 2)), half * 6, far * 2)
-        stage.add(floor, stage.paint(size=far * rng.uniform(0.1, 0.6)), None, rotation(0, 0, float(rng.normal(0, 0.08))),
-                  (0, far * rng.uniform(0.1, 0.35), 0))  # fmt: skip
+        stage.add(
+            floor,
+            stage.paint(size=far * rng.uniform(0.1, 0.6)),
+            None,
+            rotation(0, 0, float(rng.normal(0, 0.08))),
+            (0, far * rng.uniform(0.1, 0.35), 0),
+        )
     for _ in range(int(np.exp(rng.uniform(np.log(10), np.log(70))))):
         z = far * rng.uniform(0.22, 1.0) ** float(rng.uniform(0.6, 1.6))
         reach = z * np.tan(stage.field_of_view / 2)
@@ -77,7 +91,11 @@ def pile(stage: Stage) -> None:
         maker = SOLIDS[int(rng.integers(len(SOLIDS)))]
         low = rng.random() < 0.6
         y = -size / 2 if low else -rng.uniform(0.0, 1.3)
-        maker(stage, size, np.array([rng.uniform(-1.2, 1.2) * z * half, y, z]),
-              rotation(*rng.uniform(-3.1, 3.1, 3)) if turn is None else turn)  # fmt: skip
+        maker(
+            stage,
+            size,
+            np.array([rng.uniform(-1.2, 1.2) * z * half, y, z]),
+            rotation(*rng.uniform(-3.1, 3.1, 3)) if turn is None else turn,
+        )
     if rng.random() < 0.75:
         stage.shadows, stage.shadow_centre = 2.0, np.array([0, -0.3, (near + far) / 2])

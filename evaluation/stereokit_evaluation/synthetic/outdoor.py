@@ -1,155 +1,43 @@
-"""Outdoors at eye height: ground, road, facades, cars, fences, poles, wires, trees, hedges, grass, rocks, the sky."""
+"""Outdoors at eye height, under the sky: roads, and rough ground with plants and rocks."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit_evaluation.synthetic.meshes import blob, box, cards, heightfield, lathe, merge, rotation, sheet, tube
+from stereokit_evaluation.synthetic.meshes import blob, box, cards, heightfield, merge, rotation, sheet
+from stereokit_evaluation.synthetic.roadside import car, fence, front, hedge, pole
 from stereokit_evaluation.synthetic.stage import Stage
 from stereokit_evaluation.synthetic.terrain import relief
 from stereokit_evaluation.synthetic.things import bumps, solid, tree, wire
 
-__all__ = ["car", "daylight", "garden", "road"]
+__all__ = ["garden", "road"]
 
 Float = NDArray[np.float64]
 
 
-def daylight(stage: Stage, reach: float) -> None:
+def _daylight(stage: Stage, reach: float) -> None:
     """Light from the sky, and mostly from the sun, with its shadows up to `reach` metres around."""
     rng = stage.rng
     sunny = rng.random() < 0.65
     sky = float(rng.choice([0.9, 1.6, 3.0]))
     stage.light = {
         "sun": float(rng.uniform(0.6, 1.8)) if sunny else 0.0,
-        "sun_x": float(rng.normal(0, 0.9)), "sun_y": -float(rng.uniform(0.35, 1.3)), "sun_z": float(rng.normal(-0.3, 0.8)),
+        "sun_x": float(rng.normal(0, 0.9)),
+        "sun_y": -float(rng.uniform(0.35, 1.3)),
+        "sun_z": float(rng.normal(-0.3, 0.8)),
         "ambient": float(rng.uniform(0.2, 0.5)) if sunny else float(rng.uniform(0.6, 0.9)),
-        "sky_low": sky, "sky_high": sky * float(rng.uniform(0.35, 1.0)), "clouds": float(rng.choice([0.0, 0.2, 0.8])) * sky,
+        "sky_low": sky,
+        "sky_high": sky * float(rng.uniform(0.35, 1.0)),
+        "clouds": float(rng.choice([0.0, 0.2, 0.8])) * sky,
         "around": stage.slot(str(rng.choice(["fractal", "facade", "photograph", "speckle"]))),
-        "around_level": float(rng.integers(1, 5)), "around_gain": float(rng.uniform(0.6, 1.8)),
-        "fog": float(rng.choice([0.0, 0.002, 0.008, 0.02], p=[0.4, 0.3, 0.2, 0.1])), "fog_brightness": 0.6 * sky,
-    }  # fmt: skip
+        "around_level": float(rng.integers(1, 5)),
+        "around_gain": float(rng.uniform(0.6, 1.8)),
+        "fog": float(rng.choice([0.0, 0.002, 0.008, 0.02], p=[0.4, 0.3, 0.2, 0.1])),
+        "fog_brightness": 0.6 * sky,
+    }
     if sunny:
         stage.shadows, stage.shadow_centre = reach, np.array([0.0, 0.0, reach * 0.8])
-
-
-def car(stage: Stage, at: Float, yaw: float) -> None:
-    """Add a car: glossy, often dark paint without texture; panes that mirror the sky."""
-    rng = stage.rng
-    turn = rotation(yaw)
-    length, width, height = rng.uniform(3.4, 5.0), rng.uniform(1.6, 2.0), rng.uniform(1.35, 2.1)
-    coat = stage.paint(size=3.0, albedo=float(rng.choice([rng.uniform(0.01, 0.1), rng.uniform(0.1, 0.8)])), plain=True,
-                       gloss=float(rng.uniform(0.2, 1.0)), sharpness=int(rng.integers(4, 8)),
-                       mirror=float(rng.choice([0.0, 0.05, 0.2])))  # fmt: skip
-    pane = stage.paint("collage", 1.0, 0.05, float(rng.choice([0.0, 0.12])), plain=False, detail=None, gloss=0.5, sharpness=7,
-                       mirror=float(rng.uniform(0.1, 0.7)), clear=float(rng.choice([0.0, rng.uniform(0.3, 0.8)])))  # fmt: skip
-    low, waist = height * 0.18, height * 0.58
-    body = blob(1.0, power=0.32, steps=20)
-    stage.add(body, coat, None, turn @ np.diag([width / 2, (waist - low) / 2, length / 2]), at + np.array([0, -(waist + low) / 2, 0]))
-    shift = turn @ np.array([0, 0, length * rng.uniform(-0.05, 0.1)])
-    roof = float(rng.uniform(0.27, 0.4))
-    stage.add(blob(1.0, power=0.5, steps=20), pane, None, turn @ np.diag([width * 0.44, height * 0.42, length * roof]),
-              at + np.array([0, -waist, 0]) + shift)  # fmt: skip
-    stage.add(box(width * 0.72, 0.05, length * roof * 1.2), coat, None, turn, at + np.array([0, -height, 0]) + shift)
-    for sx in (-1, 1):
-        for k in (-0.35, 0.35):
-            post = turn @ np.array([sx * width * 0.42, -(waist + height) / 2, k * length * roof * 2])
-            lean = rotation(0, float(np.sign(k)) * 0.35)
-            stage.add(box(0.07, (height - waist) * 1.05, 0.09), coat, None, turn @ lean, at + post + shift)
-    seat = stage.paint(size=1.0, albedo=float(rng.uniform(0.02, 0.3)))
-    for sx in (-0.22, 0.22):
-        for k in (-0.2, 0.15):
-            chair = turn @ np.array([sx * width, -waist - 0.12, k * length * roof * 2])
-            stage.add(box(0.5, 0.6, 0.15), seat, None, turn, at + chair + shift)
-            stage.add(box(0.25, 0.22, 0.1), seat, None, turn, at + chair + shift - [0, 0.42, 0])
-    tyre = stage.paint("fractal", 0.5, 0.05, 0.05, plain=False)
-    rim = stage.paint("collage", 0.8, 0.5, 0.6, plain=False)
-    radius = height * 0.2
-    for sx in (-1, 1):
-        for sz in (-1, 1):
-            spot = at + turn @ np.array([sx * width * 0.47, -radius, sz * length * 0.32])
-            side = turn @ rotation(0, 0, np.pi / 2)
-            stage.add(lathe(np.array([1e-6, radius, radius, 1e-6]), np.array([-0.12, -0.12, 0.12, 0.12]), 24), tyre, None, side, spot)
-            stage.add(lathe(np.array([1e-6, radius * 0.65]), np.array([0.0, 0.0]), 20), rim, None, side,
-                      spot + turn @ np.array([sx * 0.125, 0, 0]))  # fmt: skip
-    lights = stage.paint("collage", 0.3, 0.6, 0.8, plain=False, gloss=1.0, emission=float(rng.choice([0, 0.5])))
-    for sz in (-1, 1):
-        for sx in (-1, 1):
-            spot = turn @ np.array([sx * width * 0.36, -waist * 0.78, sz * length * 0.495])
-            stage.add(box(0.35, 0.16, 0.06), lights, None, turn, at + spot)
-        stage.add(sheet(0.5, 0.12), stage.paint("print", 0.4, 0.7, 0.8, plain=False), None, turn,
-                  at + turn @ np.array([0, -waist * 0.55, sz * (length * 0.505)]))  # fmt: skip
-
-
-def _front(stage: Stage, width: float, height: float, at: Float, yaw: float) -> None:
-    """Add the front of a house, with sills, balconies, pillars, pipes; `at` is the middle of its foot."""
-    rng = stage.rng
-    turn = rotation(yaw)
-    wall = stage.paint(str(rng.choice(["facade", "facade", "facade", "tiles", "fractal", "photograph"])), float(rng.uniform(5, 16)),
-                       float(rng.uniform(0.25, 0.7)), float(rng.uniform(0.4, 1.4)), gloss=float(rng.choice([0, 0, 0.3])))  # fmt: skip
-    stage.add(box(width, height * 2, 8.0), wall, None, turn, at + turn @ np.array([0, 0, 4.0]))
-    trim = stage.paint("fractal", 1.0, float(rng.uniform(0.3, 0.8)), plain=bool(rng.random() < 0.6))
-    pitch = float(rng.uniform(2.0, 4.0))
-    kind = rng.random()
-    parts = []
-    for k in range(int(width / pitch)):
-        x = -width / 2 + (k + 0.5) * pitch
-        if kind < 0.3:
-            parts.append(box(0.3, height, 0.3).moved(None, (x, -height / 2, -0.15)))
-        elif kind < 0.75:
-            for storey in range(int(height / 3)):
-                y = -3 * storey - 1.2
-                parts.append(box(1.3, 0.08, 0.25).moved(None, (x, y, -0.12)))
-                if kind > 0.6:
-                    parts.append(box(1.6, 0.1, 1.0).moved(None, (x, y + 0.3, -0.5)))
-                    parts.extend(box(0.03, 0.9, 0.03).moved(None, (x - 0.75 + 0.15 * j, y - 0.15, -0.98)) for j in range(11))
-    if parts:
-        stage.add(merge(parts), trim, None, turn, at)
-
-
-def _hedge(stage: Stage, a: Float, b: Float, height: float) -> None:
-    """Add a hedge or a row of bushes between two points on the ground."""
-    rng = stage.rng
-    count = int(rng.integers(60, 300))
-    t = rng.random((count, 1))
-    centres = (1 - t) * a + t * b + rng.normal(0, 0.25, (count, 3)) * height
-    centres[:, 1] = a[1] - rng.random(count) * height
-    leaves = stage.paint(str(rng.choice(["fractal", "speckle", "strokes"])), 0.6, float(rng.uniform(0.1, 0.35)), 0.3, plain=False)
-    sizes = height * rng.uniform(0.2, 0.5, (count, 1)) * np.ones((1, 2))
-    stage.add(cards(centres, rng.uniform(-3, 3, (count, 3)), sizes), leaves, "foliage")
-
-
-def _fence(stage: Stage, a: Float, b: Float, height: float) -> None:
-    """Add a fence between two points on the ground: bars, boards, or netting, with posts."""
-    rng = stage.rng
-    along = b - a
-    length = float(np.sqrt((along * along).sum()))
-    yaw = float(np.arctan2(-along[2], along[0]))
-    coat = stage.paint("wood", 2.0, plain=bool(rng.random() < 0.6))
-    panels = max(1, int(length / height / 1.5))
-    for k in range(panels):
-        middle = a + along * ((k + 0.5) / panels) + np.array([0, -height / 2, 0])
-        stage.add(sheet(length / panels, height), coat, str(rng.choice(["fence", "fence", "lattice"])), rotation(yaw), middle)
-    posts = [tube(np.stack([a + along * (k / panels), a + along * (k / panels) - [0, height * 1.05, 0]]), 0.04, 6)
-             for k in range(panels + 1)]  # fmt: skip
-    stage.add(merge(posts), coat)
-
-
-def _pole(stage: Stage, at: Float) -> None:
-    """Add a pole: a sign, a lantern, or bare."""
-    rng = stage.rng
-    height = float(rng.uniform(2.2, 7))
-    metal = stage.paint("fractal", 0.5, plain=True, gloss=0.5)
-    stage.add(tube(np.stack([at, at - [0, height, 0]]), float(rng.uniform(0.025, 0.12)), 8, float(rng.uniform(0.5, 1))), metal)
-    kind = rng.random()
-    if kind < 0.5:
-        sign = stage.paint(str(rng.choice(["collage", "print"])), 0.8, 0.5, 0.9, plain=False)
-        stage.add(sheet(0.7, 0.7), sign, str(rng.choice(["disc", "star"])) if rng.random() < 0.6 else None,
-                  rotation(float(rng.normal(0, 0.4))), at + np.array([0, -height + 0.3, -0.1]))  # fmt: skip
-    elif kind < 0.75:
-        tip = at + np.array([rng.uniform(-2, 2), -height - 0.3, 0])
-        stage.add(tube(np.stack([at - [0, height, 0], tip]), 0.04, 6), metal)
-        stage.add(blob(0.25, steps=8), metal, None, None, tip)
 
 
 def road(stage: Stage) -> None:
@@ -160,18 +48,30 @@ def road(stage: Stage) -> None:
     eye = float(rng.uniform(1.1, 2.4))
     stage.place = np.array([0.0, -eye, 0.0])
     stage.look(float(rng.normal(0, 0.15)), float(rng.normal(-0.07, 0.07)), float(rng.normal(0, 0.01)))
-    daylight(stage, float(rng.uniform(14, 40)))
+    _daylight(stage, float(rng.uniform(14, 40)))
     weak = rng.random() < 0.6
-    asphalt = stage.paint(str(rng.choice(["fractal", "speckle", "cells"])), float(rng.uniform(0.5, 4)), float(rng.uniform(0.15, 0.5)),
-                          float(rng.uniform(0.08, 0.3)) if weak else float(rng.uniform(0.25, 0.7)), plain=False)  # fmt: skip
-    verge = stage.paint(str(rng.choice(["strokes", "fractal", "tiles", "cells"])), float(rng.uniform(0.8, 3)), float(rng.uniform(0.15, 0.6)))
+    asphalt = stage.paint(
+        str(rng.choice(["fractal", "speckle", "cells"])),
+        float(rng.uniform(0.5, 4)),
+        float(rng.uniform(0.15, 0.5)),
+        float(rng.uniform(0.08, 0.3)) if weak else float(rng.uniform(0.25, 0.7)),
+        plain=False,
+    )
+    verge = stage.paint(
+        str(rng.choice(["strokes", "fractal", "tiles", "cells"])),
+        float(rng.uniform(0.8, 3)),
+        float(rng.uniform(0.15, 0.6)),
+    )
     half = float(rng.uniform(2.5, 6))
     for side in (-1, 1):
         stage.add(box(40, 0.3, 260), verge, None, None, (side * (half + 20), 0.05 if rng.random() < 0.5 else 0.14, 115))
     stage.add(heightfield(np.zeros((2, 2)), half * 2, 260).moved(None, (0, 0, -5)), asphalt)
     white = stage.paint("fractal", 0.4, 0.75, 0.2, plain=bool(rng.random() < 0.5))
     if rng.random() < 0.8:
-        lines = [sheet(0.13, float(rng.uniform(1.5, 3))).moved(rotation(0, np.pi / 2), (0, -0.004, 3 + 6.0 * k)) for k in range(12)]
+        lines = [
+            sheet(0.13, float(rng.uniform(1.5, 3))).moved(rotation(0, np.pi / 2), (0, -0.004, 3 + 6.0 * k))
+            for k in range(12)
+        ]
         lines += [sheet(0.12, 200).moved(rotation(0, np.pi / 2), (s * (half - 0.3), -0.004, 100)) for s in (-1, 1)]
         stage.add(merge(lines), white)
     for side in (-1, 1):
@@ -180,28 +80,38 @@ def road(stage: Stage) -> None:
         while z < 70 and kind < 0.75:
             w = float(rng.uniform(6, 18))
             if kind < 0.5 or rng.random() < 0.5:
-                _front(stage, w, float(rng.uniform(4, 16)), np.array([side * gap, 0, z + w / 2]), side * np.pi / 2)
+                front(stage, w, float(rng.uniform(4, 16)), np.array([side * gap, 0, z + w / 2]), side * np.pi / 2)
             z += w + (float(rng.uniform(1, 8)) if rng.random() < 0.4 else 0)
         for _ in range(int(rng.integers(0, 8))):
-            tree(stage, float(rng.uniform(3, 11)), np.array([side * (half + rng.uniform(0.8, 12)), 0, rng.uniform(4, 60)]),
-                 bool(rng.random() < 0.8))  # fmt: skip
+            tree(
+                stage,
+                float(rng.uniform(3, 11)),
+                np.array([side * (half + rng.uniform(0.8, 12)), 0, rng.uniform(4, 60)]),
+                bool(rng.random() < 0.8),
+            )
         for _ in range(int(rng.integers(0, 3))):
             x, z0 = side * (half + rng.uniform(0.5, 4)), float(rng.uniform(2, 30))
             a, b = np.array([x, 0, z0]), np.array([x + rng.normal(0, 1), 0, z0 + rng.uniform(4, 20)])
-            (_hedge if rng.random() < 0.5 else _fence)(stage, a, b, float(rng.uniform(0.7, 2)))
+            (hedge if rng.random() < 0.5 else fence)(stage, a, b, float(rng.uniform(0.7, 2)))
         for _ in range(int(rng.integers(0, 6))):
-            _pole(stage, np.array([side * (half + rng.uniform(0.1, 2)), 0, rng.uniform(3, 40)]))
+            pole(stage, np.array([side * (half + rng.uniform(0.1, 2)), 0, rng.uniform(3, 40)]))
         z = float(rng.uniform(3, 12))
         while z < 45 and rng.random() < 0.75:
-            car(stage, np.array([side * (half - 1.1), 0, z]), float(rng.normal(0, 0.05)) + (np.pi if rng.random() < 0.5 else 0))
+            car(
+                stage,
+                np.array([side * (half - 1.1), 0, z]),
+                float(rng.normal(0, 0.05)) + (np.pi if rng.random() < 0.5 else 0),
+            )
             z += float(rng.uniform(5.2, 14))
     for _ in range(int(rng.integers(0, 3))):
         car(stage, np.array([rng.uniform(-0.5, 0.5) * half, 0, rng.uniform(7, 50)]), float(rng.normal(0, 0.25)))
     end = float(rng.uniform(60, 110))
     for _ in range(int(rng.integers(0, 5))):
-        _front(stage, float(rng.uniform(8, 25)), float(rng.uniform(4, 20)), np.array([rng.uniform(-40, 40), 0, end]), 0.0)
+        front(
+            stage, float(rng.uniform(8, 25)), float(rng.uniform(4, 20)), np.array([rng.uniform(-40, 40), 0, end]), 0.0
+        )
     if rng.random() < 0.5:
-        _hedge(stage, np.array([-45.0, 0, end + 2]), np.array([45.0, 0, end + 2]), float(rng.uniform(3, 10)))
+        hedge(stage, np.array([-45.0, 0, end + 2]), np.array([45.0, 0, end + 2]), float(rng.uniform(3, 10)))
     if rng.random() < 0.35:
         coat = stage.paint(plain=True, albedo=0.05)
         for k in range(int(rng.integers(1, 6))):
@@ -224,7 +134,7 @@ def garden(stage: Stage) -> None:
     eye = float(rng.uniform(0.5, 2.0))
     stage.place = np.array([0.0, -eye, 0.0])
     stage.look(float(rng.normal(0, 0.1)), float(rng.normal(-0.08, 0.1)), float(rng.normal(0, 0.02)))
-    daylight(stage, float(rng.uniform(6, 20)))
+    _daylight(stage, float(rng.uniform(6, 20)))
     deep = float(rng.uniform(14, 60))
 
     def on(x: float, z: float) -> Float:
@@ -233,8 +143,12 @@ def garden(stage: Stage) -> None:
         column = np.clip(round((x / (deep * 2) + 0.5) * 95), 0, 95)
         return np.array([x, -float(hills[row, column]), z])
 
-    earth = stage.paint(str(rng.choice(["strokes", "fractal", "cells", "speckle", "photograph", "tiles"])), float(rng.uniform(0.6, 4)),
-                        float(rng.uniform(0.15, 0.6)), gloss=0.0)  # fmt: skip
+    earth = stage.paint(
+        str(rng.choice(["strokes", "fractal", "cells", "speckle", "photograph", "tiles"])),
+        float(rng.uniform(0.6, 4)),
+        float(rng.uniform(0.15, 0.6)),
+        gloss=0.0,
+    )
     stage.add(heightfield(hills, deep * 2, deep + 3).moved(None, (0, 0, -3)), earth)
 
     def spot(near: float = 2.0) -> tuple[float, float]:
@@ -247,10 +161,12 @@ def garden(stage: Stage) -> None:
     rock = stage.paint(str(rng.choice(["fractal", "cells", "speckle"])), 1.0, float(rng.uniform(0.25, 0.7)))
     for _ in range(int(rng.integers(0, 12))):
         size = float(np.exp(rng.uniform(np.log(0.15), np.log(1.5))))
-        stage.add(blob(size / 2, bumps(rng, 20, 0.3), steps=20), rock, None, rotation(*rng.uniform(-3, 3, 3)), on(*spot()))
+        stage.add(
+            blob(size / 2, bumps(rng, 20, 0.3), steps=20), rock, None, rotation(*rng.uniform(-3, 3, 3)), on(*spot())
+        )
     for _ in range(int(rng.integers(0, 5))):
         (x, z), (u, w) = spot(), spot()
-        (_hedge if rng.random() < 0.5 else _fence)(stage, on(x, z), on(u, w), float(rng.uniform(0.4, 1.8)))
+        (hedge if rng.random() < 0.5 else fence)(stage, on(x, z), on(u, w), float(rng.uniform(0.4, 1.8)))
     count = int(np.exp(rng.uniform(np.log(10), np.log(500))))  # grass and flowers, near ones single
     tufts = np.stack([on(*spot(1.0)) for _ in range(count)])
     sizes = rng.uniform(0.1, 0.5, (count, 1)) * np.array([[1.0, 1.0]])
@@ -261,14 +177,14 @@ def garden(stage: Stage) -> None:
     if rng.random() < 0.6:
         for _ in range(int(rng.integers(1, 4))):
             x, z = spot(5.0)
-            _front(stage, float(rng.uniform(3, 15)), float(rng.uniform(1.5, 8)), on(x, z), float(rng.normal(0, 0.6)))
+            front(stage, float(rng.uniform(3, 15)), float(rng.uniform(1.5, 8)), on(x, z), float(rng.normal(0, 0.6)))
     if rng.random() < 0.6:
-        _hedge(stage, np.array([-deep, 0.5, deep]), np.array([deep, 0.5, deep]), float(rng.uniform(2, 8)))
+        hedge(stage, np.array([-deep, 0.5, deep]), np.array([deep, 0.5, deep]), float(rng.uniform(2, 8)))
     for _ in range(int(rng.integers(0, 14))):
         size = float(np.exp(rng.uniform(np.log(0.2), np.log(1.3))))
         solid(stage, size, on(*spot()) - [0, size / 2, 0], rotation(float(rng.uniform(-3, 3))))
     for _ in range(int(rng.integers(0, 4))):
-        _pole(stage, on(*spot()))
+        pole(stage, on(*spot()))
     if rng.random() < 0.3:
         x, z = spot(5.0)
         car(stage, on(x, z), float(rng.uniform(-3, 3)))

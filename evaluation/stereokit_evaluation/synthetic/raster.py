@@ -45,9 +45,21 @@ def edge_functions(points: Float, faces: NDArray[np.int32]) -> Float:
     out = np.zeros((faces.shape[0], 10))
     for m in range(faces.shape[0]):
         a, b, c = points[faces[m, 0]], points[faces[m, 1]], points[faces[m, 2]]
-        out[m, 0], out[m, 1], out[m, 2] = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
-        out[m, 3], out[m, 4], out[m, 5] = c[1] * a[2] - c[2] * a[1], c[2] * a[0] - c[0] * a[2], c[0] * a[1] - c[1] * a[0]
-        out[m, 6], out[m, 7], out[m, 8] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        out[m, 0], out[m, 1], out[m, 2] = (
+            b[1] * c[2] - b[2] * c[1],
+            b[2] * c[0] - b[0] * c[2],
+            b[0] * c[1] - b[1] * c[0],
+        )
+        out[m, 3], out[m, 4], out[m, 5] = (
+            c[1] * a[2] - c[2] * a[1],
+            c[2] * a[0] - c[0] * a[2],
+            c[0] * a[1] - c[1] * a[0],
+        )
+        out[m, 6], out[m, 7], out[m, 8] = (
+            a[1] * b[2] - a[2] * b[1],
+            a[2] * b[0] - a[0] * b[2],
+            a[0] * b[1] - a[1] * b[0],
+        )
         det = a[0] * out[m, 0] + a[1] * out[m, 1] + a[2] * out[m, 2]
         if det < 0:
             for k in range(9):
@@ -100,10 +112,22 @@ def _cut(uv: Float, face: Any, e0: float, e1: float, e2: float, mask: Any) -> bo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def visible(
-    points: Float, faces: NDArray[np.int32], edges: Float, uv: Float, face_mask: NDArray[np.int32],
-    masks: NDArray[np.uint8], focal: float, cx: float, cy: float,
-    x0: float, dx: float, columns: int, y0: float, dy: float, rows: int,
-) -> tuple[NDArray[np.int32], Float]:  # fmt: skip
+    points: Float,
+    faces: NDArray[np.int32],
+    edges: Float,
+    uv: Float,
+    face_mask: NDArray[np.int32],
+    masks: NDArray[np.uint8],
+    focal: float,
+    cx: float,
+    cy: float,
+    x0: float,
+    dx: float,
+    columns: int,
+    y0: float,
+    dy: float,
+    rows: int,
+) -> tuple[NDArray[np.int32], Float]:
     """Return which triangle each sample shows, and its inverse depth.
 
     Parameters
@@ -164,9 +188,19 @@ def visible(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def hidden(
-    points: Float, faces: NDArray[np.int32], edges: Float, uv: Float, face_mask: NDArray[np.int32],
-    masks: NDArray[np.uint8], focal: float, cx: float, cy: float, x: Float, inverse: Float, slack: float,
-) -> NDArray[np.bool_]:  # fmt: skip
+    points: Float,
+    faces: NDArray[np.int32],
+    edges: Float,
+    uv: Float,
+    face_mask: NDArray[np.int32],
+    masks: NDArray[np.uint8],
+    focal: float,
+    cx: float,
+    cy: float,
+    x: Float,
+    inverse: Float,
+    slack: float,
+) -> NDArray[np.bool_]:
     """Return which points something nearer covers in a view; exact at their positions.
 
     Parameters

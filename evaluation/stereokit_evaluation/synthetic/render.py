@@ -74,9 +74,22 @@ def _shadows(scene: Triangles, stage: Stage, sun: Float) -> tuple[Float, Float, 
     edges = edge_functions(points, scene.mesh.faces)
     middle = _SHADOW_SIDE / 2 - 0.5
     _, inverse = visible(
-        points, scene.mesh.faces, edges, scene.mesh.uv, scene.mask, scene.masks, focal, middle, middle,
-        0.0, 1.0, _SHADOW_SIDE, 0.0, 1.0, _SHADOW_SIDE,
-    )  # fmt: skip
+        points,
+        scene.mesh.faces,
+        edges,
+        scene.mesh.uv,
+        scene.mask,
+        scene.masks,
+        focal,
+        middle,
+        middle,
+        0.0,
+        1.0,
+        _SHADOW_SIDE,
+        0.0,
+        1.0,
+        _SHADOW_SIDE,
+    )
     return inverse, np.concatenate([turn, shift[:, None]], axis=1), focal
 
 
@@ -111,10 +124,17 @@ def render(stage: Stage, rig: Rig, noise: np.random.Generator) -> Rendered:
     x = np.arange(width)[None] - disparity
     order = np.argsort(x, axis=1, kind="stable")
     covered = hidden(
-        moved, mesh.faces, right_edges, *fixed, focal, cx + shift, cy,
-        np.take_along_axis(x, order, axis=1), np.take_along_axis(inverse, order, axis=1),
+        moved,
+        mesh.faces,
+        right_edges,
+        *fixed,
+        focal,
+        cx + shift,
+        cy,
+        np.take_along_axis(x, order, axis=1),
+        np.take_along_axis(inverse, order, axis=1),
         _SLACK_PX / (focal * baseline),
-    )  # fmt: skip
+    )
     seen = np.empty_like(covered)
     np.put_along_axis(seen, order, ~covered, axis=1)
     seen &= x >= 0
@@ -138,22 +158,57 @@ def render(stage: Stage, rig: Rig, noise: np.random.Generator) -> Rendered:
         place = (-0.25, 0.5, 2 * width, -0.25, 0.5, 2 * height)
         shown, near = visible(view.points, view.faces, own, *fixed, focal, middle_x, middle, *place)
         rest = (
-            scene.materials, scene.bank, light, shadow, sun_turn, sun_focal,
-            focal, middle_x, middle, -0.25, 0.5, -0.25, 0.5,
-            baseline if right else 0.0, cosine if right else 1.0, sine if right else 0.0,
-        )  # fmt: skip
+            scene.materials,
+            scene.bank,
+            light,
+            shadow,
+            sun_turn,
+            sun_focal,
+            focal,
+            middle_x,
+            middle,
+            -0.25,
+            0.5,
+            -0.25,
+            0.5,
+            baseline if right else 0.0,
+            cosine if right else 1.0,
+            sine if right else 0.0,
+        )
         behind = np.zeros((1, 1), np.float32)
         if not opaque.all():
             through, deep = visible(
-                view.points, view.faces[opaque], own[opaque], mesh.uv, scene.mask[opaque], scene.masks,
-                focal, middle_x, middle, *place,
-            )  # fmt: skip
+                view.points,
+                view.faces[opaque],
+                own[opaque],
+                mesh.uv,
+                scene.mask[opaque],
+                scene.masks,
+                focal,
+                middle_x,
+                middle,
+                *place,
+            )
             panes = (shown >= 0) & ~opaque[np.maximum(shown, 0)]
             behind = shade(
-                np.where(panes, through, -2).astype(np.int32), deep, own[opaque], view.faces[opaque], view.uv, view.normals,
-                scene.material[opaque], *rest, behind,
-            )  # fmt: skip
+                np.where(panes, through, -2).astype(np.int32),
+                deep,
+                own[opaque],
+                view.faces[opaque],
+                view.uv,
+                view.normals,
+                scene.material[opaque],
+                *rest,
+                behind,
+            )
         bright = shade(shown, near, own, view.faces, view.uv, view.normals, scene.material, *rest, behind)
         gain = gain or 1 / max(float(np.minimum(bright, 1.5).mean()), 1e-3)
-        pictures.append(expose(bright * np.float32(gain), np.maximum(near * focal * baseline - shift, 0.0), rig.right if right else rig.left, noise))
+        pictures.append(
+            expose(
+                bright * np.float32(gain),
+                np.maximum(near * focal * baseline - shift, 0.0),
+                rig.right if right else rig.left,
+                noise,
+            )
+        )
     return Rendered(pictures[0], pictures[1], disparity.astype(np.float32), seen)

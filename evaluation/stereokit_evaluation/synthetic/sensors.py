@@ -66,7 +66,9 @@ def draw_sensors(rng: Rng, harsh: float) -> tuple[Sensor, Sensor]:
     resample = float(rng.choice([0.0, rng.uniform(0.3, 0.6)], p=[0.45, 0.55]))
     vignette = rng.uniform(0, 0.15 + 0.3 * harsh)
     exposure = float(0.45 ** (1 / gamma) * np.exp(rng.normal(0.0, 0.2 + 0.3 * harsh)))
-    contrast = float(np.clip(np.exp(rng.normal(0.0, 0.15)), 0.4, 1.3)) * (rng.uniform(0.35, 0.8) if rng.random() < 0.15 else 1)
+    contrast = float(np.clip(np.exp(rng.normal(0.0, 0.15)), 0.4, 1.3)) * (
+        rng.uniform(0.35, 0.8) if rng.random() < 0.15 else 1
+    )
     black = float(rng.uniform(0, 14 + 20 * (1 - min(contrast, 1.0))))
     quality = int(rng.integers(72, 98)) if rng.random() < 0.25 + 0.2 * harsh else 0
     defocus = float(rng.uniform(0.003, 0.02)) if rng.random() < 0.08 + 0.12 * harsh else 0.0
@@ -135,16 +137,15 @@ def _defocused(fine: NDArray[np.float64], spread: NDArray[np.float64], base: flo
     steps = base + np.array([0.0, 1.0, 2.5, 5.0])
     layers = [blurred(fine, float(step)) for step in steps]
     at = np.clip(base + spread, steps[0], steps[-1])
-    out = layers[0].copy()
+    out = layers[0]
     for k in range(3):
         share = np.clip((at - steps[k]) / (steps[k + 1] - steps[k]), 0, 1)
-        out = np.where(at > steps[k], (1 - share) * layers[k] + share * layers[k + 1], out)
+        mixed = (1 - share) * layers[k] + share * layers[k + 1]
+        out = np.asarray(np.where(at > steps[k], mixed, out), np.float64)
     return out
 
 
-def expose(
-    light: NDArray[np.float32], disparity: NDArray[np.float64], sensor: Sensor, rng: Rng
-) -> NDArray[np.uint8]:
+def expose(light: NDArray[np.float32], disparity: NDArray[np.float64], sensor: Sensor, rng: Rng) -> NDArray[np.uint8]:
     """Return the picture that a camera takes.
 
     Parameters

@@ -15,17 +15,49 @@ __all__ = ["LIGHT", "MATERIAL", "shade"]
 Float = NDArray[np.float64]
 
 MATERIAL = (
-    "texture", "turn_x", "turn_y", "shift_x", "shift_y", "albedo", "contrast",
-    "detail", "detail_x", "detail_y", "detail_contrast", "gloss", "sharpness", "mirror", "emission",
+    "texture",
+    "turn_x",
+    "turn_y",
+    "shift_x",
+    "shift_y",
+    "albedo",
+    "contrast",
+    "detail",
+    "detail_x",
+    "detail_y",
+    "detail_contrast",
+    "gloss",
+    "sharpness",
+    "mirror",
+    "emission",
     "clear",
-)  # fmt: skip
+)
 """Columns of a material: slots of its two textures, repeats per metre along their axes, and what they do."""
 
 LIGHT = (
-    "sun_x", "sun_y", "sun_z", "sun", "ambient", "up_x", "up_y", "up_z", "lamp_x", "lamp_y", "lamp_z", "lamp",
-    "around", "around_level", "around_gain", "around_radius", "sky_low", "sky_high", "clouds", "fog", "fog_brightness",
+    "sun_x",
+    "sun_y",
+    "sun_z",
+    "sun",
+    "ambient",
+    "up_x",
+    "up_y",
+    "up_z",
+    "lamp_x",
+    "lamp_y",
+    "lamp_z",
+    "lamp",
+    "around",
+    "around_level",
+    "around_gain",
+    "around_radius",
+    "sky_low",
+    "sky_high",
+    "clouds",
+    "fog",
+    "fog_brightness",
     "shadow_bias",
-)  # fmt: skip
+)
 """Entries of the light; directions and places are in the left camera's coordinates."""
 
 _LEVELS, _SIZE, _STRIDE = LEVELS, SIZE, TOTAL
@@ -65,7 +97,7 @@ def _around(bank: Any, light: Float, x: float, y: float, z: float) -> float:
         a, b = (1 - abs(v)) * (1 if u >= 0 else -1), (1 - abs(u)) * (1 if v >= 0 else -1)
         u, v = a, b
     got = _sample(bank, int(light[12]), 0.5 + 0.5 * u, 0.5 + 0.5 * v, int(light[13]))
-    return max(0.0, 0.35 + got) * light[14]
+    return float(max(0.0, 0.35 + got) * light[14])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -95,12 +127,31 @@ def _lit(shadow: Float, turn: Float, focal: float, bias: float, x: float, y: flo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def shade(
-    shown: NDArray[np.int32], inverse: Float, edges: Float, faces: NDArray[np.int32], uv: Float, normals: Float,
-    face_material: NDArray[np.int32], materials: Float, bank: NDArray[np.uint8], light: Float,
-    shadow: Float, sun_turn: Float, sun_focal: float,
-    focal: float, cx: float, cy: float, x0: float, dx: float, y0: float, dy: float,
-    baseline: float, roll_cos: float, roll_sin: float, behind: NDArray[np.float32],
-) -> NDArray[np.float32]:  # fmt: skip
+    shown: NDArray[np.int32],
+    inverse: Float,
+    edges: Float,
+    faces: NDArray[np.int32],
+    uv: Float,
+    normals: Float,
+    face_material: NDArray[np.int32],
+    materials: Float,
+    bank: NDArray[np.uint8],
+    light: Float,
+    shadow: Float,
+    sun_turn: Float,
+    sun_focal: float,
+    focal: float,
+    cx: float,
+    cy: float,
+    x0: float,
+    dx: float,
+    y0: float,
+    dy: float,
+    baseline: float,
+    roll_cos: float,
+    roll_sin: float,
+    behind: NDArray[np.float32],
+) -> NDArray[np.float32]:
     """Return the brightness of every sample of a view.
 
     Parameters
@@ -177,15 +228,21 @@ def shade(
             if mat[6] != 0:
                 scale = np.sqrt(mat[1] * mat[1] + mat[2] * mat[2])
                 albedo += mat[6] * _sample(
-                    bank, int(mat[0]), mat[1] * u + mat[2] * v + mat[3], -mat[2] * u + mat[1] * v + mat[4],
+                    bank,
+                    int(mat[0]),
+                    mat[1] * u + mat[2] * v + mat[3],
+                    -mat[2] * u + mat[1] * v + mat[4],
                     _level(reach * scale * _SIZE),
-                )  # fmt: skip
+                )
             if mat[10] != 0:
                 scale = np.sqrt(mat[8] * mat[8] + mat[9] * mat[9])
                 albedo += mat[10] * _sample(
-                    bank, int(mat[7]), mat[8] * u + mat[9] * v + mat[4], -mat[9] * u + mat[8] * v + mat[3],
+                    bank,
+                    int(mat[7]),
+                    mat[8] * u + mat[9] * v + mat[4],
+                    -mat[9] * u + mat[8] * v + mat[3],
                     _level(reach * scale * _SIZE),
-                )  # fmt: skip
+                )
             albedo = max(0.01, min(1.0, albedo))
             vx, vy, vz = -wx * ray, -wy * ray, -ray  # towards this camera
             bright = light[4] * (0.75 + 0.25 * (nx * light[5] + ny * light[6] + nz * light[7]))

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit_evaluation.synthetic.bank import KINDS, mask, pyramid
+from stereokit_evaluation.synthetic.bank import KINDS, pyramid
+from stereokit_evaluation.synthetic.cutouts import mask
 from stereokit_evaluation.synthetic.meshes import Mesh, merge, rotation
 from stereokit_evaluation.synthetic.shading import LIGHT, MATERIAL
 
@@ -135,7 +136,9 @@ class Stage:
         angle = rng.uniform(0, 2 * np.pi) if turned else rng.choice([0.0, np.pi / 2]) + rng.normal(0, 0.01)
         row[:5] = self.slot(kind), np.cos(angle) / size, np.sin(angle) / size, *rng.random(2)
         row[5] = rng.uniform(0.12, 0.85) if albedo is None else albedo
-        row[6] = min(np.exp(rng.uniform(np.log(0.35), np.log(2.0))), 1.6 * row[5] + 0.1) if contrast is None else contrast
+        row[6] = (
+            min(np.exp(rng.uniform(np.log(0.35), np.log(2.0))), 1.6 * row[5] + 0.1) if contrast is None else contrast
+        )
         if detail is not None:
             fine = size * np.exp(rng.uniform(-2.2, -0.3)) if detail_size is None else detail_size
             turn = rng.uniform(0, 2 * np.pi)
@@ -149,9 +152,13 @@ class Stage:
         return len(self._materials) - 1
 
     def add(
-        self, mesh: Mesh, material: int, cut: str | None = None,
-        turn: Float | None = None, shift: tuple[float, float, float] | Float = (0.0, 0.0, 0.0),
-    ) -> None:  # fmt: skip
+        self,
+        mesh: Mesh,
+        material: int,
+        cut: str | None = None,
+        turn: Float | None = None,
+        shift: tuple[float, float, float] | Float = (0.0, 0.0, 0.0),
+    ) -> None:
         """Put a mesh into the scene; `cut` names a kind of mask."""
         number = -1
         if cut is not None:

@@ -44,7 +44,9 @@ def terrain(stage: Stage) -> None:
     stage.look(0, -np.pi / 2 + tilt, 0)
     stage.offset = True
     stage.base_ratio = float(rng.uniform(0.15, 0.6))
-    hills = relief(rng, 128, float(rng.uniform(1.3, 2.4))) * float(np.exp(rng.uniform(np.log(0.1), np.log(2.0 if town else 7.0))))
+    hills = relief(rng, 128, float(rng.uniform(1.3, 2.4))) * float(
+        np.exp(rng.uniform(np.log(0.1), np.log(2.0 if town else 7.0)))
+    )
     size = 150.0
 
     def ground(x: float, z: float) -> float:
@@ -52,13 +54,21 @@ def terrain(stage: Stage) -> None:
         k = np.clip((np.array([z + size / 2, x + size / 2]) / size * 127).round().astype(int), 0, 127)
         return float(hills[k[0], k[1]])
 
-    earth = stage.paint(str(rng.choice(["fractal", "speckle", "photograph", "cells"])),
-                        float(rng.uniform(10, 60)), float(rng.uniform(0.2, 0.5)), float(rng.uniform(0.1, 0.6)),
-                        detail_size=float(rng.uniform(3, 25)), detail_contrast=float(rng.uniform(0.05, 0.5)), plain=False)  # fmt: skip
+    earth = stage.paint(
+        str(rng.choice(["fractal", "speckle", "photograph", "cells"])),
+        float(rng.uniform(10, 60)),
+        float(rng.uniform(0.2, 0.5)),
+        float(rng.uniform(0.1, 0.6)),
+        detail_size=float(rng.uniform(3, 25)),
+        detail_contrast=float(rng.uniform(0.05, 0.5)),
+        plain=False,
+    )
     stage.add(heightfield(hills, size, size).moved(None, (0, 0, -size / 2)), earth)
     turn = rotation(float(rng.uniform(0, 3.1)))
     for _ in range(int(rng.integers(0, 14))):  # fields
-        coat = stage.paint(str(rng.choice(["stripes", "strokes", "fractal"])), float(rng.uniform(4, 25)), float(rng.uniform(0.15, 0.6)))
+        coat = stage.paint(
+            str(rng.choice(["stripes", "strokes", "fractal"])), float(rng.uniform(4, 25)), float(rng.uniform(0.15, 0.6))
+        )
         x, z = rng.uniform(-60, 60, 2)
         patch = sheet(float(rng.uniform(8, 30)), float(rng.uniform(8, 30))).moved(rotation(0, np.pi / 2))
         if np.abs(hills).max() < 1.0:
@@ -72,8 +82,15 @@ def terrain(stage: Stage) -> None:
                 for quarter in (0.0, np.pi / 2):
                     strip = sheet(pitch * 0.18, size).moved(rotation(0, np.pi / 2), (k * pitch, 0, 0))
                     stage.add(strip, asphalt, None, turn @ rotation(quarter), (0, level - 0.01 * (quarter > 0), 0))
-        roofs = [stage.paint(str(rng.choice(["tiles", "stripes", "fractal", "facade", "speckle"])), float(rng.uniform(3, 12)),
-                             float(rng.uniform(0.15, 0.85)), gloss=float(rng.choice([0, 0.4]))) for _ in range(8)]  # fmt: skip
+        roofs = [
+            stage.paint(
+                str(rng.choice(["tiles", "stripes", "fractal", "facade", "speckle"])),
+                float(rng.uniform(3, 12)),
+                float(rng.uniform(0.15, 0.85)),
+                gloss=float(rng.choice([0, 0.4])),
+            )
+            for _ in range(8)
+        ]
         walls = [stage.paint("facade", float(rng.uniform(4, 12))) for _ in range(4)]
         tall = float(np.exp(rng.uniform(np.log(1.0), np.log(14))))
         for _ in range(int(rng.integers(20, 160))):
@@ -98,10 +115,18 @@ def terrain(stage: Stage) -> None:
     woods = rng.uniform(-60, 60, (int(rng.integers(1, 7)), 2))
     crowns = []
     for _ in range(int(rng.integers(0, 240))):
-        at2 = rng.uniform(-70, 70, 2) if rng.random() < 0.4 else woods[int(rng.integers(len(woods)))] + rng.normal(0, 8, 2)
+        at2 = (
+            rng.uniform(-70, 70, 2)
+            if rng.random() < 0.4
+            else woods[int(rng.integers(len(woods)))] + rng.normal(0, 8, 2)
+        )
         radius = float(rng.uniform(0.7, 2.4))
         at = np.array([at2[0], -ground(at2[0], at2[1]) - radius * 0.7, at2[1]])
-        crowns.append(blob(radius, rng.uniform(-0.15, 0.15, (9, 17)), steps=8).moved(rotation(float(rng.uniform(0, 6))), tuple(at)))
+        crowns.append(
+            blob(radius, rng.uniform(-0.15, 0.15, (9, 17)), steps=8).moved(
+                rotation(float(rng.uniform(0, 6))), tuple(at)
+            )
+        )
     if crowns:
         stage.add(merge(crowns), leaves)
     count = int(rng.integers(0, 90))
@@ -113,10 +138,15 @@ def terrain(stage: Stage) -> None:
         coat = stage.paint(size=3.0, gloss=0.6)
         stage.add(cards(spots, turns, rng.uniform(0.8, 2.2, (count, 2))), coat)
     stage.light = {
-        "sun": float(rng.uniform(0.4, 1.2)), "sun_x": float(rng.normal(0, 1)), "sun_y": -float(rng.uniform(0.5, 1.5)),
-        "sun_z": float(rng.normal(0, 1)), "ambient": float(rng.uniform(0.15, 0.6)),
-        "around": stage.slot("fractal"), "around_level": 3.0, "around_gain": 1.0,
-    }  # fmt: skip
+        "sun": float(rng.uniform(0.4, 1.2)),
+        "sun_x": float(rng.normal(0, 1)),
+        "sun_y": -float(rng.uniform(0.5, 1.5)),
+        "sun_z": float(rng.normal(0, 1)),
+        "ambient": float(rng.uniform(0.15, 0.6)),
+        "around": stage.slot("fractal"),
+        "around_level": 3.0,
+        "around_gain": 1.0,
+    }
     if rng.random() < 0.6:  # taken at another time
         amount = float(rng.choice([0.05, 0.3, 0.8]))
         stage.later = {f"sun_{axis}": stage.light[f"sun_{axis}"] + float(rng.normal(0, amount)) for axis in "xz"}

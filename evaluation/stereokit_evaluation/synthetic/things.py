@@ -7,15 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit_evaluation.synthetic.cutouts import CUTS
 from stereokit_evaluation.synthetic.meshes import blob, box, cards, lathe, rotation, sheet, tube
 from stereokit_evaluation.synthetic.stage import Stage
 
-__all__ = ["CUTS", "SOLIDS", "bookshelf", "chair", "fur", "lamp", "plant", "solid", "sticks", "table", "tree", "wire"]
+__all__ = ["SOLIDS", "bookshelf", "chair", "fur", "lamp", "plant", "solid", "sticks", "table", "tree", "wire"]
 
 Float = NDArray[np.float64]
-
-CUTS = ("star", "disc", "shape", "holes", "lattice", "fence", "leaf", "letters")
-"""Masks of cut-outs."""
 
 
 def _coat(stage: Stage, size: float) -> int:
@@ -27,7 +25,9 @@ def _coat(stage: Stage, size: float) -> int:
         return stage.paint(size=repeat, turned=True)
     if kind < 0.93:
         return stage.paint(size=repeat, gloss=rng.uniform(0.1, 1.2), sharpness=int(rng.integers(2, 8)), turned=True)
-    return stage.paint(size=repeat, gloss=0.5, sharpness=7, mirror=rng.uniform(0.05, 0.6), albedo=rng.uniform(0.02, 0.5))
+    return stage.paint(
+        size=repeat, gloss=0.5, sharpness=7, mirror=rng.uniform(0.05, 0.6), albedo=rng.uniform(0.02, 0.5)
+    )
 
 
 def _box(stage: Stage, size: float, at: Float, turn: Float) -> None:
@@ -48,7 +48,12 @@ def bumps(rng: np.random.Generator, steps: int, amount: float, order: int = 5) -
     for k in range(1, order + 1):
         for m in range(order + 1):
             a = rng.normal(0, amount / (k + m))
-            out += a * np.sin(down) ** max(m, 1) * np.cos(k * down + rng.uniform(0, 6)) * np.cos(m * angle + rng.uniform(0, 6))
+            out += (
+                a
+                * np.sin(down) ** max(m, 1)
+                * np.cos(k * down + rng.uniform(0, 6))
+                * np.cos(m * angle + rng.uniform(0, 6))
+            )
     return np.asarray(np.clip(out, -0.6, 0.9))
 
 
@@ -82,14 +87,21 @@ def _paper(stage: Stage, size: float, at: Float, turn: Float) -> None:
     bend = float(rng.normal(0, 0.8)) if rng.random() < 0.5 else 0.0
     wave = float(size * rng.uniform(0, 0.08)) if rng.random() < 0.3 else 0.0
     cut = str(rng.choice(CUTS)) if rng.random() < 0.6 else None
-    stage.add(sheet(w, h, bend, wave, float(rng.uniform(0.5, 3)), 1 if bend == 0 and wave == 0 else 24),
-              _coat(stage, size), cut, turn, at)  # fmt: skip
+    stage.add(
+        sheet(w, h, bend, wave, float(rng.uniform(0.5, 3)), 1 if bend == 0 and wave == 0 else 24),
+        _coat(stage, size),
+        cut,
+        turn,
+        at,
+    )
 
 
 def _ring(stage: Stage, size: float, at: Float, turn: Float) -> None:
     rng = stage.rng
     angle = np.linspace(0, 2 * np.pi * rng.uniform(0.4, 1.0), 36)
-    path = np.stack([np.cos(angle), np.sin(angle) * rng.uniform(0.4, 1), angle * rng.uniform(0, 0.2)], axis=1) * size * 0.4
+    path = (
+        np.stack([np.cos(angle), np.sin(angle) * rng.uniform(0.4, 1), angle * rng.uniform(0, 0.2)], axis=1) * size * 0.4
+    )
     stage.add(tube(path, size * rng.uniform(0.02, 0.12), 10), _coat(stage, size), None, turn, at)
 
 
@@ -115,8 +127,14 @@ def plant(stage: Stage, size: float, at: Float, turn: Float) -> None:
     """Add a pot plant or a bush: stems and many single leaves."""
     rng = stage.rng
     count = int(np.exp(rng.uniform(np.log(25), np.log(220))))
-    leaf = stage.paint(str(rng.choice(["fractal", "vessels", "strokes"])), size * 0.3, rng.uniform(0.12, 0.5),
-                       rng.uniform(0.05, 0.4), gloss=float(rng.choice([0.0, 0.3])), plain=bool(rng.random() < 0.3))  # fmt: skip
+    leaf = stage.paint(
+        str(rng.choice(["fractal", "vessels", "strokes"])),
+        size * 0.3,
+        rng.uniform(0.12, 0.5),
+        rng.uniform(0.05, 0.4),
+        gloss=float(rng.choice([0.0, 0.3])),
+        plain=bool(rng.random() < 0.3),
+    )
     centres = rng.normal(0, 1, (count, 3))
     centres *= (rng.random(count) ** 0.4 / np.sqrt((centres**2).sum(axis=1)))[:, None] * size * 0.5
     length = size * rng.uniform(0.06, 0.3)
@@ -134,7 +152,9 @@ def tree(stage: Stage, height: float, at: Float, leafy: bool = True) -> None:
     rng = stage.rng
     bark = stage.paint(str(rng.choice(["strokes", "fractal", "wood"])), 0.5, rng.uniform(0.1, 0.4))
     top = np.array([rng.normal(0, 0.05), -1.0, rng.normal(0, 0.05)]) * height * 0.75
-    stage.add(tube(np.stack([np.zeros(3), top * 0.5, top]), height * rng.uniform(0.012, 0.035), 8, 0.3), bark, None, None, at)
+    stage.add(
+        tube(np.stack([np.zeros(3), top * 0.5, top]), height * rng.uniform(0.012, 0.035), 8, 0.3), bark, None, None, at
+    )
     for _ in range(int(rng.integers(4, 22))):
         foot = top * rng.uniform(0.35, 1.0)
         tip = foot + rng.normal(0, 0.22, 3) * height - [0, 0.1 * height, 0]
@@ -148,8 +168,13 @@ def tree(stage: Stage, height: float, at: Float, leafy: bool = True) -> None:
     centres *= (rng.random(count) ** 0.33 / np.sqrt((centres**2).sum(axis=1)))[:, None]
     centres = centres * spread * height + top * rng.uniform(0.8, 1.0)
     sizes = height * rng.uniform(0.06, 0.18) * rng.uniform(0.6, 1.4, (count, 1)) * np.ones((1, 2))
-    leaves = stage.paint(str(rng.choice(["fractal", "speckle", "strokes"])), height * 0.2, rng.uniform(0.12, 0.45),
-                         rng.uniform(0.1, 0.4), plain=False)  # fmt: skip
+    leaves = stage.paint(
+        str(rng.choice(["fractal", "speckle", "strokes"])),
+        height * 0.2,
+        rng.uniform(0.12, 0.45),
+        rng.uniform(0.1, 0.4),
+        plain=False,
+    )
     stage.add(cards(centres, rng.uniform(-3, 3, (count, 3)), sizes), leaves, "foliage", None, at)
 
 
@@ -157,8 +182,13 @@ def table(stage: Stage, size: float, at: Float, yaw: float) -> tuple[float, floa
     """Add a table that stands at `at`; return the width and the depth of its top. Its height is 0.75 * size."""
     rng = stage.rng
     w, d, h = size * rng.uniform(0.8, 1.7), size * rng.uniform(0.6, 1.0), size * 0.75
-    wood = stage.paint(str(rng.choice(["wood", "fractal", "wood"])), size, gloss=float(rng.choice([0, 0.3, 0.8])),
-                       sharpness=5, mirror=float(rng.choice([0, 0, 0.08])))  # fmt: skip
+    wood = stage.paint(
+        str(rng.choice(["wood", "fractal", "wood"])),
+        size,
+        gloss=float(rng.choice([0, 0.3, 0.8])),
+        sharpness=5,
+        mirror=float(rng.choice([0, 0, 0.08])),
+    )
     turn = rotation(yaw)
     stage.add(box(w, size * 0.04, d), wood, None, turn, at + np.array([0, -h, 0]))
     leg = size * rng.uniform(0.015, 0.05)
@@ -197,10 +227,17 @@ def lamp(stage: Stage, size: float, at: Float) -> None:
     pole = stage.paint(size=size, plain=True, gloss=0.8)
     stage.add(tube(np.array([[0, 0, 0], [0, -size, 0]]), size * rng.uniform(0.004, 0.012), 8), pole, None, None, at)
     radius = size * rng.uniform(0.08, 0.18)
-    shade = stage.paint(size=radius * 2, albedo=0.7, emission=float(rng.choice([0.0, 0.4, 1.2])), plain=bool(rng.random() < 0.7))
+    shade = stage.paint(
+        size=radius * 2, albedo=0.7, emission=float(rng.choice([0.0, 0.4, 1.2])), plain=bool(rng.random() < 0.7)
+    )
     h = radius * rng.uniform(0.8, 2.0)
-    stage.add(lathe(np.array([radius * rng.uniform(0.4, 1), radius]), np.array([-h / 2, h / 2]), 36), shade,
-              None, None, at + np.array([0, -size, 0]))  # fmt: skip
+    stage.add(
+        lathe(np.array([radius * rng.uniform(0.4, 1), radius]), np.array([-h / 2, h / 2]), 36),
+        shade,
+        None,
+        None,
+        at + np.array([0, -size, 0]),
+    )
 
 
 def bookshelf(stage: Stage, width: float, height: float, at: Float, yaw: float) -> None:
@@ -233,19 +270,37 @@ def fur(stage: Stage, size: float, at: Float, turn: Float) -> None:
     """Add a hairy ball: tufts of blades all over it."""
     rng = stage.rng
     count = int(rng.integers(150, 700))
-    coat = stage.paint(str(rng.choice(["strokes", "fractal"])), size * 0.2, gloss=float(rng.choice([0.0, 0.4])), plain=False)
+    coat = stage.paint(
+        str(rng.choice(["strokes", "fractal"])), size * 0.2, gloss=float(rng.choice([0.0, 0.4])), plain=False
+    )
     stage.add(blob(size * 0.42, steps=16), coat, None, turn, at)
     out = rng.normal(0, 1, (count, 3))
     out /= np.sqrt((out * out).sum(axis=1, keepdims=True))
     pitch, yaw = -np.arcsin(np.clip(out[:, 1], -1, 1)) - np.pi / 2, np.arctan2(out[:, 0], out[:, 2])
     turns = np.stack([yaw, pitch, rng.uniform(-3, 3, count)], axis=1) + rng.normal(0, 0.25, (count, 3))
     length = size * rng.uniform(0.1, 0.3)
-    stage.add(cards(out * (size * 0.42 + length * 0.3), turns, length * rng.uniform(0.6, 1.2, (count, 2))), coat, "blades", turn, at)
+    stage.add(
+        cards(out * (size * 0.42 + length * 0.3), turns, length * rng.uniform(0.6, 1.2, (count, 2))),
+        coat,
+        "blades",
+        turn,
+        at,
+    )
 
 
 SOLIDS: tuple[Callable[[Stage, float, Float, Float], None], ...] = (
-    _box, _ball, _lump, _vase, _can, _paper, _paper, _ring, sticks, plant, fur,
-)  # fmt: skip
+    _box,
+    _ball,
+    _lump,
+    _vase,
+    _can,
+    _paper,
+    _paper,
+    _ring,
+    sticks,
+    plant,
+    fur,
+)
 """Makers of loose things: called with the stage, a size, a place, and a turn."""
 
 

@@ -33,7 +33,7 @@ def _daylight(stage: Stage, reach: float) -> None:
         "around": stage.slot(str(rng.choice(["fractal", "facade", "photograph", "speckle"]))),
         "around_level": float(rng.integers(1, 5)),
         "around_gain": float(rng.uniform(0.6, 1.8)),
-        "fog": float(rng.choice([0.0, 0.002, 0.008, 0.02], p=[0.4, 0.3, 0.2, 0.1])),
+        "fog": float(rng.choice([0.0, 0.002, 0.008, 0.02], p=[0.5, 0.3, 0.15, 0.05])),
         "fog_brightness": 0.6 * sky,
     }
     if sunny:
@@ -43,18 +43,19 @@ def _daylight(stage: Stage, reach: float) -> None:
 def road(stage: Stage) -> None:
     """Fill `stage` with a road between fronts, trees, fences and cars."""
     rng = stage.rng
-    stage.plain = float(rng.choice([0.05, 0.15, 0.35]))
+    stage.plain = float(rng.choice([0.02, 0.1, 0.25]))
     stage.field_of_view = float(rng.uniform(0.6, 1.5))
     eye = float(rng.uniform(1.1, 2.4))
     stage.place = np.array([0.0, -eye, 0.0])
     stage.look(float(rng.normal(0, 0.15)), float(rng.normal(-0.07, 0.07)), float(rng.normal(0, 0.01)))
     _daylight(stage, float(rng.uniform(14, 40)))
-    weak = rng.random() < 0.6
+    weak, wet = rng.random() < 0.5, float(rng.choice([0.0, rng.uniform(0.02, 0.12)], p=[0.8, 0.2]))
     asphalt = stage.paint(
         str(rng.choice(["fractal", "speckle", "cells"])),
         float(rng.uniform(0.5, 4)),
         float(rng.uniform(0.15, 0.5)),
-        float(rng.uniform(0.08, 0.3)) if weak else float(rng.uniform(0.25, 0.7)),
+        float(rng.uniform(0.1, 0.3)) if weak else float(rng.uniform(0.3, 0.8)),
+        mirror=wet,
         plain=False,
     )
     verge = stage.paint(

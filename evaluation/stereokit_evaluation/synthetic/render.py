@@ -144,7 +144,11 @@ def render(stage: Stage, rig: Rig, noise: np.random.Generator) -> Rendered:
     pictures = []
     gain = 0.0
     opaque = scene.materials[scene.material, MATERIAL.index("clear")] == 0
+    materials = scene.materials
     for right in (False, True):
+        if right and stage.fickle > 0:
+            materials = materials.copy()
+            materials[:, [5, 6, 10]] *= np.exp(stage.fickle * noise.standard_normal((len(materials), 3)))
         if not right or stage.later:
             light = stage.lights(right=right)
             light[LIGHT.index("shadow_bias")] = 4 * stage.shadows / _SHADOW_SIDE
@@ -158,7 +162,7 @@ def render(stage: Stage, rig: Rig, noise: np.random.Generator) -> Rendered:
         place = (-0.25, 0.5, 2 * width, -0.25, 0.5, 2 * height)
         shown, near = visible(view.points, view.faces, own, *fixed, focal, middle_x, middle, *place)
         rest = (
-            scene.materials,
+            materials,
             scene.bank,
             light,
             shadow,

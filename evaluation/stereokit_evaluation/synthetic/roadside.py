@@ -24,7 +24,7 @@ def car(stage: Stage, at: Float, yaw: float) -> None:
         plain=True,
         gloss=float(rng.uniform(0.2, 1.0)),
         sharpness=int(rng.integers(4, 8)),
-        mirror=float(rng.choice([0.0, 0.05, 0.2])),
+        mirror=float(rng.choice([0.0, 0.0, 0.05, 0.2])),
     )
     pane = stage.paint(
         "collage",
@@ -134,6 +134,26 @@ def front(stage: Stage, width: float, height: float, at: Float, yaw: float) -> N
                     )
     if parts:
         stage.add(merge(parts), trim, None, turn, at)
+    if rng.random() < 0.35:  # panes that mirror what is around, which matches elsewhere
+        pane = stage.paint(
+            "facade",
+            3.0,
+            float(rng.uniform(0.03, 0.3)),
+            float(rng.choice([0.0, 0.1, 0.3])),
+            detail_contrast=0.03,
+            gloss=0.5,
+            sharpness=7,
+            mirror=float(rng.uniform(0.1, 0.7)),
+            plain=False,
+        )
+        w, h = pitch * rng.uniform(0.3, 0.8), rng.uniform(1.2, 2.4)
+        panes = [
+            sheet(w, h).moved(None, (-width / 2 + (k + 0.5) * pitch, -3 * storey - 1.6, -0.01))
+            for k in range(int(width / pitch))
+            for storey in range(int(height / 3))
+        ]
+        if panes:
+            stage.add(merge(panes), pane, None, turn, at)
 
 
 def hedge(stage: Stage, a: Float, b: Float, height: float) -> None:

@@ -129,7 +129,7 @@ def room(stage: Stage) -> None:
 def hall(stage: Stage) -> None:
     """Fill `stage` with a work hall: crates, racks, pipes, machines, cables, bare walls, ladders, bars."""
     rng = stage.rng
-    stage.plain = float(rng.choice([0.05, 0.2, 0.4], p=[0.45, 0.35, 0.2]))
+    stage.plain = float(rng.choice([0.02, 0.1, 0.25], p=[0.5, 0.35, 0.15]))
     stage.field_of_view = float(rng.uniform(0.6, 1.4))
     width, depth, height = rng.uniform(5, 16), rng.uniform(6, 25), rng.uniform(3, 8)
     half, quarter = width / 2, np.pi / 2
@@ -138,7 +138,7 @@ def hall(stage: Stage) -> None:
     studio_light(stage)
     if rng.random() < 0.7:
         stage.light |= {
-            "lamp": rng.uniform(2, 12),
+            "lamp": rng.uniform(1, 5),
             "lamp_x": rng.normal(0, width / 4),
             "lamp_y": -height * 0.9,
             "lamp_z": rng.uniform(0.3, 0.9) * depth,

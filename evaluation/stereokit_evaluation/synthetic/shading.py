@@ -243,6 +243,14 @@ def shade(
                     -mat[9] * u + mat[8] * v + mat[3],
                     _level(reach * scale * _SIZE),
                 )
+                # once more, five times coarser and turned: real surfaces have detail from every distance
+                albedo += mat[10] * _sample(
+                    bank,
+                    int(mat[7]),
+                    0.2 * (mat[9] * u + mat[8] * v) + mat[3],
+                    0.2 * (mat[8] * u - mat[9] * v) + mat[4],
+                    _level(0.2 * reach * scale * _SIZE),
+                )
             albedo = max(0.01, min(1.0, albedo))
             vx, vy, vz = -wx * ray, -wy * ray, -ray  # towards this camera
             bright = light[4] * (0.75 + 0.25 * (nx * light[5] + ny * light[6] + nz * light[7]))

@@ -54,6 +54,9 @@ class Stage:
         Its middle.
     later : dict
         What differs in the light when the right view is taken.
+    fickle : float
+        How much the brightness and the contrast of each material differ in the right view, standard deviation of the
+        logarithm: views taken on different days.
     offset : bool
         Shift the right view so that the smallest disparity is small, as rectified pictures of a far scene are.
     base_ratio : float
@@ -69,6 +72,7 @@ class Stage:
     shadows: float = 0.0
     shadow_centre: Float = field(default_factory=lambda: np.array([0.0, 0.0, 5.0]))
     later: dict[str, float] = field(default_factory=dict)
+    fickle: float = 0.0
     offset: bool = False
     base_ratio: float = 0.4
     _parts: list[tuple[Mesh, int, int]] = field(default_factory=list)

@@ -114,7 +114,7 @@ def terrain(stage: Stage) -> None:
     leaves = stage.paint(str(rng.choice(["fractal", "speckle"])), 3.0, float(rng.uniform(0.08, 0.3)), 0.2, plain=False)
     woods = rng.uniform(-60, 60, (int(rng.integers(1, 7)), 2))
     crowns = []
-    for _ in range(int(rng.integers(0, 240))):
+    for _ in range(int(rng.integers(0, 320))):
         at2 = (
             rng.uniform(-70, 70, 2)
             if rng.random() < 0.4
@@ -150,6 +150,7 @@ def terrain(stage: Stage) -> None:
     if rng.random() < 0.6:  # taken at another time
         amount = float(rng.choice([0.05, 0.3, 0.8]))
         stage.later = {f"sun_{axis}": stage.light[f"sun_{axis}"] + float(rng.normal(0, amount)) for axis in "xz"}
+        stage.fickle = float(rng.choice([0.0, 0.15, 0.35]))
         stage.later["sun"] = stage.light["sun"] * float(np.exp(rng.normal(0, 0.3)))
     if rng.random() < 0.85:
         stage.shadows, stage.shadow_centre = 80.0, np.zeros(3)

@@ -23,6 +23,7 @@ from stereokit.errors import OptionError, StereokitError
 from stereokit.postprocess import fill
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
+from stereokit_refiners.linear import doubled
 from stereokit_refiners.runtimes.compose import compose
 from stereokit_refiners.runtimes.encode import encode
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
@@ -160,12 +161,12 @@ class LearnedRefiner:
         full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
         if shift < 0:
             full += 2 * shift
-        known = _doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
+        known = doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
         if gaps:
-            missing = _doubled(unknown.view(np.uint8), rows, columns).astype(bool)
+            missing = doubled(unknown.view(np.uint8), rows, columns).astype(bool)
             full[missing] = np.nan
             known &= ~missing
-        sure = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
+        sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
@@ -203,13 +204,6 @@ def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:
 
 def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArray[np.float32]:
     return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
-
-
-def _doubled(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
-    """Return each pixel four times, cut to a size."""
-    size = (2 * image.shape[1], 2 * image.shape[0])
-    large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)).reshape(size[1], size[0])
-    return np.ascontiguousarray(large[:rows, :columns])
 
 
 def _backend(name: str) -> str:

@@ -174,13 +174,16 @@ class Stage:
         lengths = [len(mesh.faces) for mesh, _, _ in self._parts]
         world = merge([mesh for mesh, _, _ in self._parts])
         masks = [mask(*key) for key in self._masks] or [np.ones((256, 256), np.uint8)]
-        seen = Mesh((world.points - self.place) @ self.turn, world.normals @ self.turn, world.uv, world.faces)
+        seen = Mesh(
+            _snapped((world.points - self.place) @ self.turn), _snapped(world.normals @ self.turn), _snapped(world.uv),
+            world.faces,
+        )  # fmt: skip
         return Triangles(
             mesh=seen,
             material=np.repeat(np.array([part[1] for part in self._parts], np.int32), lengths),
             mask=np.repeat(np.array([part[2] for part in self._parts], np.int32), lengths),
             masks=np.stack(masks),
-            materials=np.stack(self._materials),
+            materials=_snapped(np.stack(self._materials)),
             bank=np.concatenate([pyramid(*key) for key in self._textures]),
         )
 
@@ -192,4 +195,12 @@ class Stage:
         row[:3] = sun @ self.turn
         row[5:8] = np.array([0.0, -1.0, 0.0]) @ self.turn
         row[8:11] = (row[8:11] - self.place) @ self.turn
-        return row
+        return _snapped(row)
+
+
+def _snapped(values: Float) -> Float:
+    """Return values on a grid of 2 ** -24, a few millionths of a millimetre.
+
+    Processors differ in the last bit of a sine or a matrix product; on the grid they all render the same scene.
+    """
+    return np.asarray(np.rint(values * 2.0**24) / 2.0**24)

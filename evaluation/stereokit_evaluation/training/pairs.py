@@ -6,7 +6,6 @@ drawn from its seed. They are slow to render, so they are kept in a folder, unde
 
 from __future__ import annotations
 
-import hashlib
 import io
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError
 from stereokit.io import make_folder, parsing, write_bytes
+from stereokit_evaluation.common.fingerprint import fingerprint
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.synthetic.scenes import generate
 from stereokit_refiners.training.samples import Pair
@@ -96,7 +96,4 @@ def _fingerprint() -> str:
     """Return a digest of the sources that draw streets."""
     here = Path(__file__)
     parts = ("scenes", "street", "geometry", "textures", "sprites", "backdrops")
-    digest = hashlib.sha256()
-    for path in (*(here.parents[1] / "synthetic" / f"{part}.py" for part in parts), here):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
+    return fingerprint((*(here.parents[1] / "synthetic" / f"{part}.py" for part in parts), here))

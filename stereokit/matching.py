@@ -30,7 +30,7 @@ from stereokit.images.gray import (
     check_number,
     gray_pair,
     guide_of,
-    half_size,
+    reduced,
     smooth,
 )
 from stereokit.kernels.threads import available_threads, crew
@@ -71,11 +71,12 @@ class Matcher:
     max_disparity, min_disparity : int
         Disparities ``min_disparity <= d < max_disparity`` are tried, in full-size pixels. The minimum may be
         negative. 1 to 2048 levels.
-    scale : {1.0, 0.5}
-        0.5 matches at half size and lets `refiner` bring the map to full size.
+    scale : {1.0, 0.5, 0.25}
+        0.5 and 0.25 match at half and at a quarter of the size, and let `refiner` bring the map to full size.
     refiner : str, callable or None
-        For ``scale=0.5``: the name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
-        `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
+        The name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
+        `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones need
+        ``stereokit[fast]``; those other than ``"general"`` need ``scale=0.5``.
     device : {"auto", "cpu", "cuda"}
         Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``; "auto" takes it
         where it can be used, else the CPU. Refiners run on the CPU, but for `on_device`.
@@ -119,22 +120,22 @@ class Matcher:
         levels = check_levels(min_disparity, max_disparity)
         self.min_disparity = levels.minimum
         self.max_disparity = levels.minimum + levels.count
-        if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or scale not in (1, 0.5):
-            raise OptionError(f"scale must be 1 or 0.5, got {scale!r}")
+        if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or scale not in (1, 0.5, 0.25):
+            raise OptionError(f"scale must be 1, 0.5 or 0.25, got {scale!r}")
         self.scale = float(scale)
         if not isinstance(device, str) or device not in ("auto", "cpu", "cuda"):
             raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {device!r}")
         if device == "cuda":
             require_device()
         self.threads = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
-        if refiner is not None and self.scale == 1:
-            raise OptionError(f"refiner needs scale=0.5, got refiner={refiner!r} with scale=1")
         self.refiner: str | None = None
         self._refine: Callable[..., Disparity] | None = None
         refiner_options: list[str] = []
-        if self.scale == 0.5:
+        if self.scale != 1 or refiner is not None:
             self.refiner, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
             self._refine = factory(**{k: options[k] for k in refiner_options if k in options})
+            if self.scale != 0.5 and not getattr(self._refine, "any_scale", False):
+                raise OptionError(f"refiner {self.refiner!r} needs scale=0.5, got scale={self.scale:g}")
         self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
         self._asks = bool(getattr(self._refine, "needs_candidates", False))
         self._confident = self.confidence or self._asks or bool(getattr(self._refine, "needs_confidence", False))
@@ -148,6 +149,8 @@ class Matcher:
         from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
 
         try:
+            if self.scale == 0.25:
+                raise DeviceError("scale must be 1 or 0.5 with device 'cuda', got 0.25")
             self._cuda = CudaPipeline(self._cuda_settings(), getattr(self._refine, "on_device", None))
             self.device = "cuda"
         except DeviceError:
@@ -167,8 +170,8 @@ class Matcher:
     def _levels(self) -> Levels:
         """Return the levels of the size at which is matched."""
         low, high = self.min_disparity, self.max_disparity
-        if self.scale == 0.5:
-            low, high = low // 2, max(-(-high // 2), low // 2 + 1)
+        step = round(1 / self.scale)
+        low, high = low // step, max(-(-high // step), low // step + 1)
         return Levels(low, high - low)
 
     def _set_stages(self, options: dict[str, Any], elsewhere: list[str]) -> None:
@@ -176,7 +179,7 @@ class Matcher:
         cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         cost_options, aggregation_options = option_names(cost), option_names(aggregation)
         check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options, *elsewhere}))
-        merged = {**defaults_of(self.method, half=self.scale == 0.5), **options}
+        merged = {**defaults_of(self.method, half=self.scale != 1), **options}
         self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
         if "p2" not in options and "p2" in merged:  # a default gives way to what the cost leaves of 8 bits
             merged["p2"] = min(merged["p2"], (255 - self.cost.cost_max) / self.cost.unit)
@@ -239,6 +242,8 @@ class Matcher:
         """
         if self._cuda is None:
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
+        if self.scale == 1 and self.refiner is not None:
+            raise DeviceError(f"refiner must be None for images on the device with scale=1, got {self.refiner!r}")
         found = self._cuda.device(left, right, stream)
         return found if self.confidence else replace(found, confidence=None)
 
@@ -334,12 +339,19 @@ class Matcher:
             found = self._cuda.host(pair)
         else:
             with crew(threads):
-                same = self._refine is None
-                found = self._match_with_crew(pair if same else half_size(pair), self._levels(), workspace, threads)
+                small = reduced(pair, round(1 / self.scale))
+                found = self._match_with_crew(small, self._levels(), workspace, threads)
         if self._refine is None:
             return found
-        refined = self._refine(found, pair.guide, threads=threads)
-        return refined if self.confidence else Disparity(refined.disparity, refined.valid)
+        further: dict[str, Any] = {}
+        if getattr(self._refine, "any_scale", False):
+            further["scale"] = self.scale
+        if getattr(self._refine, "needs_right", False):
+            further["right"] = guide_of(pair.right, pair.left)
+        refined = self._refine(found, pair.guide, threads=threads, **further)
+        # A level of a smaller image stands for several of the full one: some of them are outside the range.
+        within = np.clip(refined.disparity, self.min_disparity, self.max_disparity - 1)
+        return Disparity(within, refined.valid, refined.confidence if self.confidence else None)
 
     def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
         low = levels.minimum

@@ -25,12 +25,22 @@ from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
 from stereokit_refiners.runtimes.compose import compose
 from stereokit_refiners.runtimes.encode import encode
+from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.mixture import mixture
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
 
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner"]
+__all__ = [
+    "BACKENDS",
+    "PRECISIONS",
+    "CnnRefiner",
+    "EvidenceRefiner",
+    "LearnedRefiner",
+    "PyramidRefiner",
+    "StereoVaeRefiner",
+]
 
 BACKENDS = ("openvino", "onnxruntime", "torch")
 PRECISIONS = ("fp32", "bf16", "int8")
@@ -125,12 +135,12 @@ class LearnedRefiner:
     @property
     def needs_confidence(self) -> bool:
         """Whether the coarse map must come with the matcher's confidence."""
-        return "confidence" in network_named(self._file.network).inputs
+        return not {"confidence", "evidence"}.isdisjoint(network_named(self._file.network).inputs)
 
     @property
     def needs_candidates(self) -> bool:
         """Whether the coarse map must come with the matcher's candidates."""
-        return "candidates" in network_named(self._file.network).inputs
+        return not {"candidates", "evidence"}.isdisjoint(network_named(self._file.network).inputs)
 
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
@@ -160,18 +170,62 @@ class LearnedRefiner:
         full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
         if shift < 0:
             full += 2 * shift
-        known = _doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
+        known = _enlarged(coarse.valid.view(np.uint8), 2, rows, columns).astype(bool)
         if gaps:
-            missing = _doubled(unknown.view(np.uint8), rows, columns).astype(bool)
+            missing = _enlarged(unknown.view(np.uint8), 2, rows, columns).astype(bool)
             full[missing] = np.nan
             known &= ~missing
-        sure = None if coarse.confidence is None else _doubled(coarse.confidence, rows, columns)
+        sure = None if coarse.confidence is None else _enlarged(coarse.confidence, 2, rows, columns)
         return Disparity(full, known, sure)
 
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
         found: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceRefiner(LearnedRefiner):
+    """The one for every camera: see `stereokit_refiners.networks.evidence`."""
+
+    architecture: ClassVar[str] = "evidence"
+    any_scale: ClassVar[bool] = True
+    needs_right: ClassVar[bool] = True
+    on_device: ClassVar[None] = None  # type: ignore[assignment]  # it works on the host only
+
+    def __call__(  # type: ignore[override]
+        self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any], scale: float = 0.5, threads: int = 1
+    ) -> Disparity:
+        """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
+
+        Where the coarse map is NaN, the result is; the network sees it filled.
+        """
+        rows, columns = left.shape
+        step = round(1 / scale)
+        wanted = (-(-rows // step), -(-columns // step))
+        if coarse.disparity.shape != wanted:
+            raise OptionError(
+                f"coarse map must be {wanted} for left {left.shape} and scale {scale:g}, got {coarse.disparity.shape}"
+            )
+        if right.shape != left.shape:
+            raise OptionError(f"right must have the size of left {left.shape}, got {right.shape}")
+        confidence, candidates = coarse.confidence, coarse.candidates
+        if confidence is None or candidates is None:
+            raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+        disparity = coarse.disparity
+        unknown = np.isnan(disparity)
+        gaps = bool(unknown.any())
+        if gaps:
+            disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
+        found = hypotheses(disparity, candidates, left, right, step, threads)
+        inputs = {"evidence": network_input(found, confidence, left, columns, threads)}
+        full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
+        known = _enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
+        if gaps:
+            missing = _enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
+            full[missing] = np.nan
+            known &= ~missing
+        return Disparity(full, known, sure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,9 +259,9 @@ def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArra
     return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
 
 
-def _doubled(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
-    """Return each pixel four times, cut to a size."""
-    size = (2 * image.shape[1], 2 * image.shape[0])
+def _enlarged(image: NDArray[Any], step: int, rows: int, columns: int) -> NDArray[Any]:
+    """Return each pixel ``step * step`` times, cut to a size."""
+    size = (step * image.shape[1], step * image.shape[0])
     large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)).reshape(size[1], size[0])
     return np.ascontiguousarray(large[:rows, :columns])
 

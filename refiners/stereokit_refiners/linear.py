@@ -7,7 +7,7 @@ full-size pixels ``2 i`` and ``2 i + 1``. Odd sizes were extended by one before 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -24,18 +24,21 @@ __all__ = ["Linear"]
 
 @dataclass(frozen=True)
 class Linear:
-    """Bilinear upscaling by two; the left image is used for its size only."""
+    """Bilinear upscaling; the left image is used for its size only."""
 
-    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
+    any_scale: ClassVar[bool] = True
+
+    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1, scale: float = 0.5) -> Disparity:
         """Return the map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
         height, width = left.shape
+        step = round(1 / scale)
 
         def upscale(image: NDArray[Any], method: int) -> NDArray[Any]:
-            size = (2 * image.shape[1], 2 * image.shape[0])
+            size = (step * image.shape[1], step * image.shape[0])
             full = np.asarray(cv2.resize(image, size, interpolation=method)).reshape(size[1], size[0])
             return np.ascontiguousarray(full[:height, :width])
 
-        disparity = upscale(coarse.disparity, cv2.INTER_LINEAR) * np.float32(2)
+        disparity = upscale(coarse.disparity, cv2.INTER_LINEAR) * np.float32(step)
         valid = upscale(coarse.valid.view(np.uint8), cv2.INTER_NEAREST).astype(bool)
         valid &= ~np.isnan(disparity)
         confidence = None

@@ -31,6 +31,7 @@ __all__ = [
     "gray_pair",
     "guide_of",
     "half_size",
+    "reduced",
     "scale_guide",
     "scale_to_16_bits",
     "smooth",
@@ -264,6 +265,13 @@ def smooth(pair: GrayPair, sigma: float, workspace: Workspace | None = None, thr
 
     run([partial(blur, 0), partial(blur, 1)], threads)
     return GrayPair(blurred[0], blurred[1], pair.left_bad, pair.right_bad, pair.guide, pair.ranges)
+
+
+def reduced(pair: GrayPair, step: int) -> GrayPair:
+    """Return the pair at 1/`step` of its size, 1, 2 or 4: halved as often as that takes."""
+    while step > 1:
+        pair, step = half_size(pair), step // 2
+    return pair
 
 
 def half_size(pair: GrayPair) -> GrayPair:

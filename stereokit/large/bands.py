@@ -53,7 +53,7 @@ class Bands:
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
         self._matcher = _for_windows(matcher, (self._height, self._width), windows.window)
-        self._halo = matcher.median // 2 if matcher.scale == 1 else 0
+        self._halo = matcher.median // 2 if matcher.refiner is None else 0
         self._workspace = Workspace()
         self._last: NDArray[np.float32] | None = None  # row that a band without any valid pixel is filled from
 
@@ -86,7 +86,7 @@ class Bands:
 
     def _finished(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
         matcher = self._wanted
-        if matcher.scale != 1:
+        if matcher.refiner is not None:
             return band
         filled = matcher.fill is not None
         if filled:
@@ -102,11 +102,11 @@ class Bands:
 
 def _for_windows(matcher: Matcher, image: tuple[int, int], window: tuple[int, int]) -> Matcher:
     """Return a matcher whose largest speckle has as many pixels as in the whole image, and that leaves filling."""
-    step = 1 if matcher.scale == 1 else 2
+    step = round(1 / matcher.scale)
     whole, part = (-(-height // step) * -(-width // step) for height, width in (image, window))
     changed = copy.copy(matcher)
     if matcher.speckle:
         changed.speckle = (int(matcher.speckle * whole) + 0.5) / part
-    if matcher.scale == 1:
+    if matcher.refiner is None:
         changed.fill, changed.median = None, 0
     return changed

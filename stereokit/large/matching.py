@@ -148,7 +148,7 @@ def match_large(
     windows = _plan(matcher, sources, tone, overlap, limit, target)
     ranges: Ranges | None = None
     if isinstance(matcher.cost, Zncc):  # its grey levels depend on the range of the whole image
-        ranges = find_ranges(*sources, tone, matcher.scale != 1, matcher.smooth, matcher.threads)
+        ranges = find_ranges(*sources, tone, round(1 / matcher.scale), matcher.smooth, matcher.threads)
     bands = Bands(matcher, sources, tone, ranges, windows, progress)
     write_bands(target, height, width, bands)
     total = len(windows.rows) * len(windows.columns)

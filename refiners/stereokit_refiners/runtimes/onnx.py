@@ -83,6 +83,11 @@ class _OnnxOps:
         scales = self.constant([1, 1, 2, 2])
         return str(self.node("Resize", [x, "", scales], mode="linear", coordinate_transformation_mode="half_pixel"))
 
+    def repeat(self, x: str) -> str:
+        scales = self.constant([1, 1, 2, 2])
+        attributes = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+        return str(self.node("Resize", [x, "", scales], **attributes))
+
     def slice(self, x: str, axis: int, start: int, stop: int) -> str:
         where = [self.constant([value], np.int64) for value in (start, stop, axis)]
         return str(self.node("Slice", [x, *where]))

@@ -117,21 +117,22 @@ def hypotheses(
 
     near = relative(disparity)
     window = np.ones((_REACH, _REACH), np.uint8)
-    coarse = near if step == 1 else np.asarray(cv2.resize(near, (width, height), interpolation=cv2.INTER_LINEAR))
-    maps = [np.asarray(cv2.erode(near, window)), np.asarray(cv2.dilate(near, window)), *map(relative, candidates)]
-    others = np.stack([on_half_grid(one, step) for one in maps])
+    coarse = near
+    if step > 1:
+        coarse = np.asarray(cv2.resize(near, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    extremes = [np.asarray(pick(near, window), np.float32) for pick in (cv2.erode, cv2.dilate)]
+    others = np.stack([on_half_grid(one, step) for one in (*extremes, *map(relative, candidates))])
     base = lowest * step
-    found = Hypotheses(
-        base, step, coarse, others,
-        *(np.empty((len(VALUES), height, width), np.uint8) for _ in range(3)), np.empty((height, width), np.uint8),
-    )  # fmt: skip
-    bits = [_census_of(extended(image, height, width), threads) for image in (left, right)]
+    costs, small, large = (np.empty((len(VALUES), height, width), np.uint8) for _ in range(3))
+    outside = np.empty((height, width), np.uint8)
+    found = Hypotheses(base, step, coarse, others, costs, small, large, outside)
+    mine, theirs = (_census_of(extended(image, height, width), threads) for image in (left, right))
     parts = spans(height, threads)
     lines = [np.empty((6, width), np.int32) for _ in parts]
     run(
         [
             partial(
-                _costs, *bits, columns, base, coarse, others, found.apart, y0, y1, lines[k], found.costs, found.outside
+                _costs, mine, theirs, columns, base, coarse, others, found.apart, y0, y1, lines[k], costs, outside
             )
             for k, (y0, y1) in enumerate(parts)
         ],
@@ -139,8 +140,8 @@ def hypotheses(
     )  # fmt: skip
     run(
         [
-            partial(_mean, found.costs[k], side, out[k])
-            for side, out in ((_SMALL, found.small), (_LARGE, found.large))
+            partial(_mean, costs[k], side, out[k])
+            for side, out in ((_SMALL, small), (_LARGE, large))
             for k in range(len(VALUES))
         ],
         threads,
@@ -155,7 +156,7 @@ def _mean(costs: NDArray[np.uint8], side: int, out: NDArray[np.uint8]) -> None:
 def _census_of(image: NDArray[np.uint8], threads: int) -> NDArray[np.uint32]:
     """Return 24 bits a pixel: which neighbours of 5x5 are darker, after a light smoothing."""
     height, width = image.shape
-    wide = np.asarray(cv2.copyMakeBorder(image, 3, 3, 3, 3, cv2.BORDER_REPLICATE))
+    wide = np.asarray(cv2.copyMakeBorder(image, 3, 3, 3, 3, cv2.BORDER_REPLICATE), np.uint8)
     smooth = np.empty((height + 4, width + 4), np.uint16)
     run([partial(_smooth, wide, y0, y1, smooth) for y0, y1 in spans(height + 4, threads)], threads)
     bits = np.empty((height, width), np.uint32)

@@ -85,8 +85,12 @@ class _OnnxOps:
 
     def repeat(self, x: str) -> str:
         scales = self.constant([1, 1, 2, 2])
-        attributes = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
-        return str(self.node("Resize", [x, "", scales], **attributes))
+        return str(
+            self.node(
+                "Resize", [x, "", scales], mode="nearest", coordinate_transformation_mode="asymmetric",
+                nearest_mode="floor",
+            )
+        )  # fmt: skip
 
     def slice(self, x: str, axis: int, start: int, stop: int) -> str:
         where = [self.constant([value], np.int64) for value in (start, stop, axis)]

@@ -3,7 +3,18 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo docs test lint types check clean
+define MATCH_A_PAIR
+import cv2, numpy as np, stereokit
+from importlib.metadata import metadata
+left = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 96), dtype=np.uint8), (0, 0), 1)
+right = np.roll(left, -5, axis=1)
+assert abs(np.median(stereokit.match(left, right, max_disparity=16)) - 5) < 0.1
+cv2.imwrite("left.png", left), cv2.imwrite("right.png", right)
+print("the wheel works alone:", stereokit.__file__, metadata("stereokit")["License-Expression"])
+endef
+export MATCH_A_PAIR
+
+.PHONY: demo docs test fuzz lint types package check clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -22,6 +33,9 @@ demo: $(VENV)/.user  ## match a synthetic street with S1 to S4: pictures in demo
 test: $(VENV)/.dev  ## all tests, two files at a time
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
+fuzz: $(VENV)/.dev  ## generated calls and mutated files, ten minutes; FUZZ="--seed 2 --minutes 1" for others
+	cd tests && ../$(BIN)/python -m fuzz $(FUZZ)
+
 docs: $(VENV)/.dev  ## the documentation, in docs/_build/html; warnings are errors
 	NUMBA_CACHE_DIR=$(CURDIR)/.numba_cache $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
@@ -34,7 +48,14 @@ lint: $(VENV)/.dev  ## style and the direction of imports
 types: $(VENV)/.dev  ## the strict type checker
 	$(BIN)/mypy
 
-check: lint types test docs  ## what CI runs
+package: $(VENV)/.dev  ## wheel and sdist; the wheel alone, in an empty environment, matches a pair
+	rm -rf dist build/package
+	$(BIN)/python -m hatchling build
+	$(PYTHON) -m venv build/package
+	build/package/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	cd build/package && bin/python -c "$$MATCH_A_PAIR" && bin/stereokit match left.png right.png -o map.pfm --max-disparity 16
+
+check: lint types test docs package  ## what CI runs
 
 clean:  ## remove what the tasks made
 	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache build dist demo study docs/_build docs/_generated

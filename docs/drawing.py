@@ -11,7 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import readme_tables
+import page_tables
 import typer
 from matplotlib.figure import Figure
 
@@ -24,7 +24,7 @@ from stereokit_evaluation.scoring.error_map import error_map
 from stereokit_evaluation.scoring.kitti import score
 from stereokit_evaluation.synthetic.scenes import Scene, generate
 
-README = Path(__file__).parents[1] / "README.md"
+BENCHMARKS = Path(__file__).with_name("benchmarks.md")
 WIDTH, HEIGHT, LEVELS, TILE = 828, 250, 96, 414
 FAR_M, STREETS = 50.0, 6
 
@@ -55,10 +55,10 @@ def write_all(folder: Path) -> None:
     """Write everything into `folder`."""
     make_folder("folder", folder)
     write_bytes(folder / "commands.md", commands_help().encode())
-    measured, refined_ones = (readme_tables.find(README, head) for head in ("MB added", "ms of S4, 1 / 2 threads"))
+    measured, refined_ones = (page_tables.find(BENCHMARKS, head) for head in ("MB added", "ms of S4, 1 / 2 threads"))
     write_bytes(folder / "measured.md", measured.text.encode())
     write_bytes(folder / "refined.md", refined_ones.text.encode())
-    write_bytes(folder / "tradeoff.svg", readme_tables.tradeoff(measured))
+    write_bytes(folder / "tradeoff.svg", page_tables.tradeoff(measured))
     street = Street()
     rows = [street.panel(name, street.match(name)) for name in ("S1", "S2", "S3", "S4")]
     rows += [street.panel(f"{m}/2+stereokit: half size, refined", refined(street, m)) for m in ("S2", "S4")]

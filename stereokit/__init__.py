@@ -1,7 +1,7 @@
 """Classical stereo matching in plain Python: Census and ZNCC costs, SGM and domain-transform aggregation.
 
 >>> import stereokit
->>> disparity = stereokit.match(left, right, method="zncc+sgm")  # doctest: +SKIP
+>>> disparity = stereokit.match(left, right)  # doctest: +SKIP
 """
 
 from stereokit.calibration import Calibration

@@ -134,6 +134,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "confidence": False,
         "fill": "nearest",
         "median": 5,
+        "nodata": None,
         "outside": 0.5,
         "right": False,
         "smooth": 0.6,

@@ -15,8 +15,10 @@ __all__ = [
     "InputError",
     "OptionError",
     "StereokitError",
+    "StereokitWarning",
     "UnknownNameError",
     "did_you_mean",
+    "shown",
 ]
 
 
@@ -44,6 +46,19 @@ class FileError(StereokitError):
     """A file is missing, cannot be read as what it should be, or cannot be written."""
 
 
+class StereokitWarning(UserWarning):
+    """Something that was not refused, but hardly gives what was meant."""
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it: on one line, and not long."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # such as integers of thousands of digits
+        text = f"a value of type {type(value).__name__}"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
 def did_you_mean(kind: str, name: str, known: Iterable[str]) -> str:
     """Return the line that says that no `kind` is called `name`, with the nearest known name.
 
@@ -59,4 +74,4 @@ def did_you_mean(kind: str, name: str, known: Iterable[str]) -> str:
     names = sorted(known)
     close = difflib.get_close_matches(name.lower(), names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else "."
-    return f"no {kind} named {name!r}{hint} Known: {', '.join(names) or 'none'}"
+    return f"no {kind} named {shown(name)}{hint} Known: {', '.join(names) or 'none'}"

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import FileError, InputError, OptionError
+from stereokit.images.intensity import to_gray
 
 __all__ = [
     "DISPARITY_SUFFIXES",
@@ -168,11 +169,7 @@ def read_image(path: str | os.PathLike[str], gray: bool = False) -> NDArray[Any]
     if image.shape[2] not in (3, 4):
         raise FileError(f"{str(path)!r} has {image.shape[2]} channels, expected grey or colour")
     colors = np.ascontiguousarray(image[:, :, 2::-1])
-    if not gray:
-        return colors
-    if colors.dtype == np.float64:  # OpenCV's conversion stops at float32
-        return np.asarray(colors @ np.array([0.299, 0.587, 0.114]))
-    return np.asarray(cv2.cvtColor(colors, cv2.COLOR_RGB2GRAY))
+    return to_gray(colors) if gray else colors
 
 
 def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:

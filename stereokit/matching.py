@@ -11,54 +11,28 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Levels, Pair
+from stereokit.aggregation.contract import Aggregation
+from stereokit.costs.rows import Cost
 from stereokit.cuda.driver import has_device, require_device
-from stereokit.defaults import METHODS, defaults_of
-from stereokit.errors import DeviceError, InputError, OptionError, UnknownNameError, did_you_mean
-from stereokit.images.gray import (
-    GrayPair,
-    check_flag,
-    check_integer,
-    check_names,
-    check_number,
-    gray_pair,
-    guide_of,
-    reduced,
-    smooth,
-)
-from stereokit.kernels.threads import available_threads, crew
-from stereokit.kernels.workspace import Pool, Workspace
-from stereokit.methods import check_levels, find_refiner, option_names, parse_method
-from stereokit.postprocess.chain import Chain, post_process
-from stereokit.postprocess.fill import FILLS
-from stereokit.registry import AGGREGATIONS, COSTS
+from stereokit.defaults import METHODS
+from stereokit.errors import DeviceError, InputError, OptionError, shown
+from stereokit.images.check import check_integer
+from stereokit.images.gray import GrayPair, gray_pair, guide_of
+from stereokit.kernels.threads import Job, Workers, available_threads
+from stereokit.kernels.trace import span
+from stereokit.pipeline import CpuPipeline, Pipeline
 from stereokit.result import Disparity
-from stereokit.selection.wta import winners_like
+from stereokit.settings import MatchSettings
 
 if TYPE_CHECKING:
-    from stereokit.cuda.pipeline import CudaPipeline, DeviceDisparity, Settings
+    from stereokit.cuda.pipeline import DeviceDisparity
 
 __all__ = ["METHODS", "Matcher", "match", "warmup"]
-
-_PIPELINE = (
-    "confidence",
-    "fill",
-    "median",
-    "outside",
-    "right",
-    "smooth",
-    "smp",
-    "speckle",
-    "subpixel",
-    "uniqueness",
-)
 
 
 class Matcher:
@@ -67,7 +41,7 @@ class Matcher:
     Parameters
     ----------
     method : str
-        ``"cost+aggregation"`` or S1 to S4, any case.
+        ``"cost+aggregation"`` or S1 to S4, any case; the default, S2, is the fastest and most accurate of the four.
     max_disparity, min_disparity : int
         Disparities ``min_disparity <= d < max_disparity`` are tried, in full-size pixels. The minimum may be
         negative. 1 to 2048 levels.
@@ -91,8 +65,10 @@ class Matcher:
         ``uniqueness`` (percent by which the best rival must cost more, or the pixel is invalid), ``smp`` (bool,
         single matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the
         image), ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of the cost's
-        range, or None for the nearest border pixel), ``confidence`` (bool) and ``right`` (bool, the right view's map
-        too; twice the time). Defaults are those of `stereokit.defaults`.
+        range, or None for the nearest border pixel), ``nodata`` (value of pixels that hold nothing, which match nothing
+        and are never ``valid``; None leaves it to NaN, alpha and what `stereokit.images.intensity` sees by itself),
+        ``confidence`` (bool) and ``right`` (bool, the right view's map too; twice the time). Defaults are those of
+        `stereokit.defaults`.
 
     Raises
     ------
@@ -112,106 +88,101 @@ class Matcher:
     """
 
     def __init__(
-        self, method: str = "zncc+sgm", *, max_disparity: int = 128, min_disparity: int = 0, scale: float = 1.0,
+        self, method: str = "census+sgm", *, max_disparity: int = 128, min_disparity: int = 0, scale: float = 1.0,
         refiner: str | Callable[..., Disparity] | None = None, device: str = "auto", threads: int | None = None,
         **options: Any,
     ) -> None:  # fmt: skip
-        self.method = parse_method(method)
-        levels = check_levels(min_disparity, max_disparity)
-        self.min_disparity = levels.minimum
-        self.max_disparity = levels.minimum + levels.count
-        if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or scale not in (1, 0.5, 0.25):
-            raise OptionError(f"scale must be 1, 0.5 or 0.25, got {scale!r}")
-        self.scale = float(scale)
         if not isinstance(device, str) or device not in ("auto", "cpu", "cuda"):
-            raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {device!r}")
+            raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {shown(device)}")
         if device == "cuda":
             require_device()
         self.threads = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
-        self.refiner: str | None = None
-        self._refine: Callable[..., Disparity] | None = None
-        refiner_options: list[str] = []
-        if self.scale != 1 or refiner is not None:
-            self.refiner, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
-            self._refine = factory(**{k: options[k] for k in refiner_options if k in options})
-            if self.scale != 0.5 and not getattr(self._refine, "any_scale", False):
-                raise OptionError(f"refiner {self.refiner!r} needs scale=0.5, got scale={self.scale:g}")
-        self._set_stages({k: v for k, v in options.items() if k not in refiner_options}, refiner_options)
-        self._asks = bool(getattr(self._refine, "needs_candidates", False))
-        self._confident = self.confidence or self._asks or bool(getattr(self._refine, "needs_confidence", False))
-        self._pool = Pool()
-        self.device = "cpu"
-        self._cuda: CudaPipeline | None = None
-        if device == "cuda" or (device == "auto" and has_device()):
-            self._set_device(fall_back=device == "auto")
+        settings = MatchSettings.parse(
+            method,
+            max_disparity=max_disparity,
+            min_disparity=min_disparity,
+            scale=scale,
+            refiner=refiner,
+            options=options,
+        )
+        self._pipeline: Pipeline = _pipeline(settings, device)
 
-    def _set_device(self, fall_back: bool) -> None:
-        from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
+    @property
+    def settings(self) -> MatchSettings:
+        """All options of the match, resolved and checked."""
+        return self._pipeline.settings
 
-        try:
-            if self.scale == 0.25:
-                raise DeviceError("scale must be 1 or 0.5 with device 'cuda', got 0.25")
-            self._cuda = CudaPipeline(self._cuda_settings(), getattr(self._refine, "on_device", None))
-            self.device = "cuda"
-        except DeviceError:
-            if not fall_back:
-                raise
+    @property
+    def method(self) -> str:
+        """``"cost+aggregation"``."""
+        return self.settings.method
 
-    def _cuda_settings(self) -> Settings:
-        """Return what `stereokit.cuda.pipeline` needs to know."""
-        from stereokit.cuda.pipeline import Settings
+    @property
+    def min_disparity(self) -> int:
+        """The smallest disparity that is tried, full-size pixels."""
+        return self.settings.levels.minimum
 
-        return Settings(
-            self.cost, self.aggregation, self._levels(), self.scale == 0.5, self.smooth, self.outside, self.subpixel,
-            self.uniqueness, 2 if self._asks else int(self._confident), self.right, self.smp, self.speckle, self.fill,
-            self.median,
-        )  # fmt: skip
+    @property
+    def max_disparity(self) -> int:
+        """All disparities that are tried are below this, full-size pixels."""
+        return self.settings.levels.minimum + self.settings.levels.count
 
-    def _levels(self) -> Levels:
-        """Return the levels of the size at which is matched."""
-        low, high = self.min_disparity, self.max_disparity
-        step = round(1 / self.scale)
-        low, high = low // step, max(-(-high // step), low // step + 1)
-        return Levels(low, high - low)
+    @property
+    def scale(self) -> float:
+        """1, or 0.5 or 0.25 where is matched at a smaller size."""
+        return self.settings.scale
 
-    def _set_stages(self, options: dict[str, Any], elsewhere: list[str]) -> None:
-        cost_name, aggregation_name = self.method.split("+")
-        cost, aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
-        cost_options, aggregation_options = option_names(cost), option_names(aggregation)
-        check_names("option", options, sorted({*_PIPELINE, *cost_options, *aggregation_options, *elsewhere}))
-        merged = {**defaults_of(self.method, half=self.scale != 1), **options}
-        self.cost = cost(**{k: merged[k] for k in cost_options if k in merged})
-        if "p2" not in options and "p2" in merged:  # a default gives way to what the cost leaves of 8 bits
-            merged["p2"] = min(merged["p2"], (255 - self.cost.cost_max) / self.cost.unit)
-        self.aggregation = aggregation(**{k: merged[k] for k in aggregation_options if k in merged})
-        if hasattr(self.aggregation, "penalties"):
-            self.aggregation.penalties(self.cost.cost_max, self.cost.unit)
-        self.fill = None if merged["fill"] in (None, "none") else merged["fill"]
-        if self.fill is not None and (not isinstance(self.fill, str) or self.fill not in FILLS):
-            raise UnknownNameError(did_you_mean("fill", str(self.fill), (*FILLS, "none")))
-        self.median = check_integer("median", merged["median"])
-        if self.median not in (0, 3, 5):
-            raise OptionError(f"median must be 0, 3 or 5, got {self.median}")
-        outside = merged["outside"]
-        self.outside = None if outside is None else check_number("outside", outside, 0, 1)
-        self.smooth = check_number("smooth", merged["smooth"], 0, 10)
-        self.uniqueness = check_number("uniqueness", merged["uniqueness"], 0, 100)
-        self.speckle = check_number("speckle", merged["speckle"], 0, 1)
-        self.smp = check_flag("smp", merged["smp"])
-        self.subpixel = check_flag("subpixel", merged["subpixel"])
-        self.confidence = check_flag("confidence", merged["confidence"])
-        self.right = check_flag("right", merged["right"])
+    @property
+    def cost(self) -> Cost:
+        """The cost with its options."""
+        return self.settings.cost
+
+    @property
+    def aggregation(self) -> Aggregation:
+        """The aggregation with its options."""
+        return self.settings.aggregation
+
+    @property
+    def refiner(self) -> str | None:
+        """The refiner's name, or the path of its weights; None at full size."""
+        return self.settings.refiner_name
+
+    @property
+    def refine(self) -> Callable[..., Disparity] | None:
+        """The refiner itself (`stereokit_refiners.contract.Refiner`); None at full size."""
+        return self.settings.refiner
+
+    @property
+    def device(self) -> str:
+        """``"cpu"`` or ``"cuda"``."""
+        return "cpu" if isinstance(self._pipeline, CpuPipeline) else "cuda"
+
+    def identity(self) -> dict[str, Any]:
+        """Return what a map depends on beside the images, as plain values, fit for JSON.
+
+        Neither `device` nor `threads` is among them. Refiners are told apart by their ``fingerprint``.
+        """
+        return self.settings.identity()
+
+    def replaced(self, **changes: Any) -> Matcher:
+        """Return a matcher that differs in some of its `settings`, by their names."""
+        changed = Matcher.__new__(Matcher)
+        changed.threads = self.threads
+        changed._pipeline = self._pipeline.replaced(**changes)
+        return changed
+
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+        """Return how many bytes of buffers a pair takes; see `stereokit.pipeline.Pipeline`."""
+        return self._pipeline.nbytes(height, width, dtype)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_pool", "_cuda")}
+        return {"settings": self.settings, "threads": self.threads, "device": self.device}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._pool = Pool()
-        self._cuda = None
-        if self.device == "cuda":
+        self.threads = state["threads"]
+        if state["device"] == "cuda":
             require_device()
-            self._set_device(fall_back=False)
+        self._pipeline = _pipeline(state["settings"], state["device"])
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
@@ -240,20 +211,25 @@ class Matcher:
             If the matcher's device is not "cuda", the refiner of half size works on the host only or `fill` is None
             there, or the device is short of memory.
         """
-        if self._cuda is None:
+        if isinstance(self._pipeline, CpuPipeline):
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
         if self.scale == 1 and self.refiner is not None:
             raise DeviceError(f"refiner must be None for images on the device with scale=1, got {self.refiner!r}")
-        found = self._cuda.device(left, right, stream)
-        return found if self.confidence else replace(found, confidence=None)
+        if self.settings.nodata is not None:
+            raise DeviceError(f"nodata must be None for images on the device, got {self.settings.nodata:g}")
+        pipeline: Any = self._pipeline
+        result: DeviceDisparity = pipeline.match_on_device(left, right, stream)
+        return result
 
     def __call__(self, left: Any, right: Any) -> Disparity:
         """Match a rectified pair.
 
         Parameters
         ----------
-        left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
-            Grey or RGB, of one size and type; never modified. NaN and infinite pixels count as no evidence.
+        left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
+            Grey, RGB or RGBA, of one size and type; never modified. One may be grey and the other in colour: both are
+            matched in grey. Pixels that are NaN, infinite, `nodata`, of alpha 0 or evident marks such as -3.4e38
+            count as no evidence.
 
         Returns
         -------
@@ -266,6 +242,11 @@ class Matcher:
         ------
         InputError
             If the images cannot be used.
+
+        Warns
+        -----
+        StereokitWarning
+            If few grey levels hold nearly all pixels of images of more than 8 bits.
         """
         return self._call(left, right, self.threads)
 
@@ -294,85 +275,67 @@ class Matcher:
         InputError
             When the turn comes of a pair that cannot be used.
         """
-        ahead: deque[Future[Disparity]] = deque()
+        ahead: deque[Job[Disparity]] = deque()
         source = iter(pairs)
-        workers = self.threads if self._cuda is None else min(2, self.threads)  # each has buffers on the device
-        with ThreadPoolExecutor(workers, thread_name_prefix="stereokit-map") as executor:
-            try:
-                failure: BaseException | None = None  # of the source: what it gave before is still matched
-                for done in itertools.count(1):
-                    while failure is None and len(ahead) < 2 * self.threads:
-                        try:
-                            pair = next(source)
-                            left, right = pair
-                        except (TypeError, ValueError):
-                            failure = InputError("pairs must give (left, right) each time")
-                        except BaseException as error:
-                            failure = error
-                        else:
-                            ahead.append(executor.submit(self._call, left, right, 1))
-                    if not ahead:
-                        if isinstance(failure, StopIteration):
-                            return
-                        assert failure is not None
-                        raise failure
-                    yield ahead.popleft().result()
-                    if progress is not None:
-                        progress(done)
-            finally:
-                for waiting in ahead:
-                    waiting.cancel()
+        # On a GPU each worker has buffers of its own there.
+        workers = Workers(self.threads if self.device == "cpu" else min(2, self.threads))
+        try:
+            failure: Exception | None = None  # of the source: what it gave before is still matched
+            for done in itertools.count(1):
+                while failure is None and len(ahead) < 2 * self.threads:
+                    try:
+                        pair = next(source)
+                        left, right = pair
+                    except (TypeError, ValueError):
+                        failure = InputError("pairs must give (left, right) each time")
+                    except Exception as error:
+                        failure = error
+                    else:
+                        ahead.append(Job(self._call, left, right, 1))
+                        workers.submit(ahead[-1])
+                if not ahead:
+                    if isinstance(failure, StopIteration):
+                        return
+                    assert failure is not None
+                    raise failure
+                result = ahead[0].result()
+                ahead.popleft()
+                yield result
+                if progress is not None:
+                    progress(done)
+        finally:
+            for job in ahead:
+                job.withdraw()
+            workers.close()
 
     def _call(self, left: Any, right: Any, threads: int) -> Disparity:
-        pair = gray_pair(left, right)
-        with self._pool.take() as workspace:
-            full = self.match_gray(pair, workspace, threads)
-            if not self.right:
-                return full
-            mirrored = self.match_gray(_mirror(pair), workspace, threads)
+        with span("prepare", "checks and grey"):
+            pair = gray_pair(left, right, self.settings.nodata)
+        return self.match_gray(pair, threads)
+
+    def match_gray(self, pair: GrayPair, threads: int) -> Disparity:
+        """Match a pair that was checked and is grey."""
+        full = self._pipeline.match(pair, threads)
+        if not self.settings.right:
+            return full
+        mirrored = self._pipeline.match(_mirror(pair), threads)
         other = np.ascontiguousarray(mirrored.disparity[:, ::-1])
         return Disparity(full.disparity, full.valid, full.confidence, other)
 
-    def match_gray(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
-        """Match a pair that was checked and is grey, with buffers of the caller; no right view's map."""
-        if self._cuda is not None:
-            found = self._cuda.host(pair)
-        else:
-            with crew(threads):
-                small = reduced(pair, round(1 / self.scale))
-                found = self._match_with_crew(small, self._levels(), workspace, threads)
-        if self._refine is None:
-            return found
-        further: dict[str, Any] = {}
-        if getattr(self._refine, "any_scale", False):
-            further["scale"] = self.scale
-        if getattr(self._refine, "needs_right", False):
-            further["right"] = guide_of(pair.right, pair.left)
-        refined = self._refine(found, pair.guide, threads=threads, **further)
-        # A level of a smaller image stands for several of the full one: some of them are outside the range.
-        within = np.clip(refined.disparity, self.min_disparity, self.max_disparity - 1)
-        return Disparity(within, refined.valid, refined.confidence if self.confidence else None)
 
-    def _match_with_crew(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Disparity:
-        low = levels.minimum
-        pair = smooth(pair, self.smooth, workspace, threads)
-        shape = pair.left.shape
-        rows = self.cost.prepare(
-            Pair(pair.left, pair.right, pair.left_bad, pair.right_bad, levels, self.outside, threads, pair.ranges),
-            workspace,
-            max(2, threads),
-        )
-        disparity = workspace.array("match.disparity", shape, np.float32)
-        cost = workspace.array("match.cost", shape, self.aggregation.total_dtype)
-        confidence = np.empty(shape, np.float32) if self._confident else None
-        candidates = np.empty((2, *shape), np.float32) if self._asks else None
-        out = winners_like(disparity, cost, confidence, levels.count, low, self.subpixel, self.uniqueness, candidates)
-        self.aggregation.sweep(rows, levels, self.cost, pair.guide, workspace, threads, out)
-        chain = Chain(self.smp, int(self.speckle * disparity.size), self.fill, self.median, low)
-        disparity, valid = post_process(disparity, cost, pair.left_bad, chain, workspace, threads)
-        if confidence is not None:
-            confidence[~valid] = 0
-        return Disparity(disparity, valid, confidence, candidates=candidates)
+def _pipeline(settings: MatchSettings, device: str) -> Pipeline:
+    """Return the way through the GPU where it is asked for and can be had, else the one through the CPU."""
+    if device == "cuda" or (device == "auto" and has_device()):
+        from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
+
+        try:
+            if settings.scale == 0.25:
+                raise DeviceError("scale must be 1 or 0.5 with device 'cuda', got 0.25")
+            return CudaPipeline(settings)
+        except DeviceError:
+            if device == "cuda":
+                raise
+    return CpuPipeline(settings)
 
 
 def _mirror(pair: GrayPair) -> GrayPair:
@@ -384,24 +347,24 @@ def _mirror(pair: GrayPair) -> GrayPair:
     left, right = flip(pair.right), flip(pair.left)
     assert left is not None and right is not None
     ranges = None if pair.ranges is None else (pair.ranges[1], pair.ranges[0])
-    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges)
+    return GrayPair(left, right, flip(pair.right_bad), flip(pair.left_bad), guide_of(left, right), ranges, pair.span)
 
 
 _matchers: dict[Any, Matcher] = {}
 _matchers_lock = threading.Lock()
 
 
-def match(left: Any, right: Any, method: str = "zncc+sgm", **options: Any) -> NDArray[np.float32]:
+def match(left: Any, right: Any, /, method: str = "census+sgm", **options: Any) -> NDArray[np.float32]:
     """Match a rectified pair and return the left view's disparity map.
 
     Parameters
     ----------
-    left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
-        Rectified images of one size and type, grey or RGB.
+    left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
+        Rectified images of one size and type, grey, RGB or RGBA.
     method : str
         ``"cost+aggregation"`` or S1 to S4.
     **options
-        Those of `Matcher`.
+        Those of `Matcher`, but ``right``: this returns the left view's map alone.
 
     Returns
     -------
@@ -413,8 +376,10 @@ def match(left: Any, right: Any, method: str = "zncc+sgm", **options: Any) -> ND
     InputError, OptionError
         If an image or an option cannot be used.
     """
+    if options.pop("right", False) is not False:
+        raise OptionError("right must be False here, where only the left view's map is returned; see Matcher")
     try:
-        key = (method, tuple((name, type(options[name]), options[name]) for name in sorted(options)))
+        key = (method, tuple((name, type(options[name]), _version(options[name])) for name in sorted(options)))
         hash(key)
     except TypeError:
         return Matcher(method, **options)(left, right).disparity
@@ -424,6 +389,17 @@ def match(left: Any, right: Any, method: str = "zncc+sgm", **options: Any) -> ND
         while len(_matchers) > 4:
             _matchers.pop(next(iter(_matchers)))
     return matcher(left, right).disparity
+
+
+def _version(option: Any) -> Any:
+    """Return an option with what tells one content of a weight file from the next, where it is the path of one."""
+    if isinstance(option, (str, os.PathLike)) and os.fspath(option).endswith(".safetensors"):
+        try:
+            status = os.stat(option)
+        except OSError:
+            return option
+        return option, status.st_mtime_ns, status.st_size, status.st_ino
+    return option
 
 
 def warmup(*methods: str, max_disparity: int = 128) -> None:

@@ -15,8 +15,8 @@ from stereokit.aggregation import dt as _dt  # noqa: F401
 from stereokit.aggregation import sgm as _sgm  # noqa: F401
 from stereokit.costs.rows import Levels
 from stereokit.defaults import METHODS
-from stereokit.errors import OptionError, UnknownNameError, did_you_mean
-from stereokit.images.gray import MAX_DISPARITY, check_integer, check_names
+from stereokit.errors import OptionError, UnknownNameError, did_you_mean, shown
+from stereokit.images.check import MAX_DISPARITY, check_integer, check_names
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 
 __all__ = ["build_aggregation", "build_cost", "check_levels", "find_refiner", "option_names", "parse_method"]
@@ -33,7 +33,7 @@ def parse_method(method: str) -> str:
         If there is no such method, cost or aggregation.
     """
     if not isinstance(method, str):
-        raise OptionError(f"method must be a name such as 'zncc+sgm' or 'S4', got {method!r}")
+        raise OptionError(f"method must be a name such as 'zncc+sgm' or 'S4', got {shown(method)}")
     text = method.strip()
     text = METHODS.get(text.upper(), text.lower())
     parts = [part.strip() for part in text.split("+")]
@@ -50,7 +50,7 @@ def check_levels(min_disparity: Any, max_disparity: Any) -> Levels:
     low = check_integer("min_disparity", min_disparity, -MAX_DISPARITY, MAX_DISPARITY)
     high = check_integer("max_disparity", max_disparity, low + 1)
     if high - low > _MAX_LEVELS:
-        raise OptionError(f"max_disparity - min_disparity must be at most {_MAX_LEVELS}, got {high - low}")
+        raise OptionError(f"max_disparity - min_disparity must be at most {_MAX_LEVELS}, got {shown(high - low)}")
     return Levels(low, high - low)
 
 
@@ -96,7 +96,7 @@ def find_refiner(refiner: Any) -> tuple[str, Callable[..., Any], list[str]]:
         factory = REFINERS.get(refiner)
         return refiner.lower(), factory, option_names(factory)
     if not callable(refiner):
-        raise OptionError(f"refiner must be a name, a weight file or callable, got {refiner!r}")
+        raise OptionError(f"refiner must be a name, a weight file or callable, got {shown(refiner)}")
     return type(refiner).__name__.lower(), lambda: refiner, []
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
-from stereokit.errors import OptionError, UnknownNameError, did_you_mean
+from stereokit.errors import OptionError, UnknownNameError, did_you_mean, shown
 
 __all__ = ["AGGREGATIONS", "COSTS", "REFINERS", "Registry"]
 
@@ -61,7 +61,7 @@ class Registry(Generic[T]):
             If nothing has that name.
         """
         if not isinstance(name, str):
-            raise OptionError(f"{self.kind} must be a name, got {name!r}")
+            raise OptionError(f"{self.kind} must be a name, got {shown(name)}")
         key = name.lower()
         if key not in self._items:
             for entry in self._entries():

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume
+from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume, takes_8_bits
 from stereokit.errors import InputError, OptionError
-from stereokit.images.gray import check_integer, check_number, gray_pair, writable
-from stereokit.images.gray import smooth as smoothed
+from stereokit.images.check import check_integer, check_nodata, check_number, writable
+from stereokit.images.gray import gray_pair
+from stereokit.images.maps import numbers
+from stereokit.images.resize import smooth as smoothed
 from stereokit.kernels.threads import available_threads
 from stereokit.kernels.workspace import Workspace
 from stereokit.methods import build_aggregation, build_cost, check_levels
@@ -27,14 +29,15 @@ __all__ = ["aggregate", "cost_volume"]
 
 def cost_volume(
     left: Any, right: Any, cost: str | Cost = "zncc", *, max_disparity: int = 128, min_disparity: int = 0,
-    outside: float | None = 1.0, smooth: float = 0.0, threads: int | None = None, **options: Any,
+    outside: float | None = 1.0, smooth: float = 0.0, nodata: float | None = None, threads: int | None = None,
+    **options: Any,
 ) -> NDArray[np.uint8]:  # fmt: skip
     """Return the matching costs of all pixels and levels.
 
     Parameters
     ----------
-    left, right : (H, W) or (H, W, 3), uint8, uint16, float32 or float64
-        Rectified images.
+    left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
+        Rectified images, as `stereokit.match` takes them.
     cost : str or Cost
         Name of the cost, or the cost itself.
     max_disparity, min_disparity : int
@@ -43,6 +46,8 @@ def cost_volume(
         Cost of matches outside the right image as a share of the cost's range; None takes the border pixel.
     smooth : float
         Sigma in pixels of a Gaussian on both images before matching.
+    nodata : float or None
+        Value of pixels without evidence.
     threads : int or None
         Threads; None uses the processors at hand.
     **options
@@ -62,7 +67,8 @@ def cost_volume(
     levels = check_levels(min_disparity, max_disparity)
     count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
     share = None if outside is None else check_number("outside", outside, 0, 1)
-    gray = smoothed(gray_pair(left, right), check_number("smooth", smooth, 0, 10))
+    sigma = check_number("smooth", smooth, 0, 10)
+    gray = smoothed(gray_pair(left, right, check_nodata(nodata)), sigma, eight_bits=takes_8_bits(stage))
     pair = Pair(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
     return produce_volume(stage.prepare(pair, Workspace(), count), gray.left.shape, levels, count)
 
@@ -101,13 +107,15 @@ def aggregate(
     """
     stage = build_aggregation(aggregation, options)
     maker: Cost = build_cost(cost, {})
-    volume = np.asarray(volume)
+    volume = numbers("volume", volume)
     floats = volume.dtype == np.float32
     if volume.ndim != 3 or 0 in volume.shape or not (volume.dtype == np.uint8 or floats):
         raise InputError(f"volume must be (H, W, D) uint8 or float32, got {volume.dtype} {volume.shape}")
-    if floats and stage.name != "dt":
-        raise InputError("volume must be uint8 for aggregation 'sgm', got float32")
-    guide = writable(guide)
+    if floats and not getattr(stage, "accepts_floats", False):
+        raise InputError(f"volume must be uint8 for aggregation {stage.name!r}, got float32")
+    if floats and not np.isfinite(volume).all():
+        raise InputError("volume must be finite, got NaN or infinity")
+    guide = writable(numbers("guide", guide))
     if guide.dtype != np.uint8 or guide.shape != volume.shape[:2]:
         raise InputError(f"guide must be uint8 {volume.shape[:2]}, got {guide.dtype} {guide.shape}")
     count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)

@@ -25,6 +25,7 @@ if threading.current_thread() is threading.main_thread() and signal.getsignal(si
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
+from limits import HANG_S  # noqa: E402
 
 settings.register_profile("stereokit", derandomize=True, deadline=None, max_examples=20)
 settings.load_profile("stereokit")
@@ -54,7 +55,7 @@ def random_pair():
 def run_python():
     """Return a function that runs python in a new process, packages at hand, and returns its output."""
 
-    def run(*arguments, timeout=300, **environment):
+    def run(*arguments, timeout=HANG_S, **environment):
         import stereokit
         import stereokit_refiners
 

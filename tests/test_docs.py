@@ -110,7 +110,7 @@ def test_the_python_of_a_page_runs(page, street, folder, capsys):
     if isinstance(disparity, np.ndarray):
         assert np.nanmedian(np.abs(disparity - street.disparity)) < 1
     if page.stem == "README":
-        assert scope["refined"].shape == disparity.shape == street.disparity.shape
+        assert scope["depth_m"].shape == disparity.shape == street.disparity.shape
         assert (folder / "disparity.pfm").exists()
 
 
@@ -171,15 +171,15 @@ def parse(words: list[str], line: str) -> None:
         parse_method(method)
 
 
-def test_the_figures_of_the_pages_are_those_of_the_readme(monkeypatch, tmp_path):
+def test_the_figures_of_the_charts_are_those_of_the_benchmarks(monkeypatch, tmp_path):
     pytest.importorskip("matplotlib")
     monkeypatch.syspath_prepend(ROOT / "docs")
-    from readme_tables import find, tradeoff
+    from page_tables import find, tradeoff
 
-    measured = find(ROOT / "README.md", "MB added")
+    measured = find(ROOT / "docs" / "benchmarks.md", "MB added")
     assert measured.number("OpenCV 5 SGBM, 3WAY", "validation") is None
     assert b"<svg" in tradeoff(measured)
-    assert find(ROOT / "README.md", "ms of S4, 1 / 2 threads").text.startswith("| KITTI 2015")
+    assert find(ROOT / "docs" / "benchmarks.md", "ms of S4, 1 / 2 threads").text.startswith("| KITTI 2015")
     page = tmp_path / "page.md"
     page.write_text("| a | b |\n|---|---|\n| x | **1.5 %**, 7 |\n| y | |\n\nHow it was\nmeasured.\n\nMore.\n")
     table = find(page, "b")

@@ -23,6 +23,7 @@ from stereokit.errors import OptionError, StereokitError
 from stereokit.postprocess import fill
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
+from stereokit_refiners.linear import doubled, enlarged
 from stereokit_refiners.runtimes.compose import compose
 from stereokit_refiners.runtimes.encode import encode
 from stereokit_refiners.runtimes.evidence import hypotheses, network_input
@@ -170,12 +171,12 @@ class LearnedRefiner:
         full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
         if shift < 0:
             full += 2 * shift
-        known = _enlarged(coarse.valid.view(np.uint8), 2, rows, columns).astype(bool)
+        known = doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
         if gaps:
-            missing = _enlarged(unknown.view(np.uint8), 2, rows, columns).astype(bool)
+            missing = doubled(unknown.view(np.uint8), rows, columns).astype(bool)
             full[missing] = np.nan
             known &= ~missing
-        sure = None if coarse.confidence is None else _enlarged(coarse.confidence, 2, rows, columns)
+        sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
@@ -220,9 +221,9 @@ class EvidenceRefiner(LearnedRefiner):
         found = hypotheses(disparity, candidates, left, right, step, threads)
         inputs = {"evidence": network_input(found, confidence, left, columns, threads)}
         full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
-        known = _enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
+        known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
         if gaps:
-            missing = _enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
+            missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
             full[missing] = np.nan
             known &= ~missing
         return Disparity(full, known, sure)
@@ -257,13 +258,6 @@ def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:
 
 def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArray[np.float32]:
     return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
-
-
-def _enlarged(image: NDArray[Any], step: int, rows: int, columns: int) -> NDArray[Any]:
-    """Return each pixel ``step * step`` times, cut to a size."""
-    size = (step * image.shape[1], step * image.shape[0])
-    large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)).reshape(size[1], size[0])
-    return np.ascontiguousarray(large[:rows, :columns])
 
 
 def _backend(name: str) -> str:

@@ -31,13 +31,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numba import types
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels, cost_row
-from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer, check_number
-from stereokit.kernels.jit import inline, kernel
+from stereokit.errors import OptionError, shown
+from stereokit.images.check import check_integer, check_number
+from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import (
     LANES,
     add,
@@ -53,6 +52,7 @@ from stereokit.kernels.simd import (
     subtract,
 )
 from stereokit.kernels.threads import run, spans
+from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, keys_of, select_pixel
@@ -100,10 +100,12 @@ class Dt:
     passes: int = 1
     mode: str = "rf"
     name: ClassVar[str] = "dt"
+    accepts_floats: ClassVar[bool] = True
+    cuda: ClassVar[str] = "stereokit.aggregation.dt_cuda"
 
     def __post_init__(self) -> None:
-        if self.mode not in ("rf", "sum"):
-            raise OptionError(f"mode of dt must be 'rf' or 'sum', got {self.mode!r}")
+        if not isinstance(self.mode, str) or self.mode not in ("rf", "sum"):
+            raise OptionError(f"mode of dt must be 'rf' or 'sum', got {shown(self.mode)}")
         for name in ("sigma_s", "sigma_v", "sigma_r"):
             value = getattr(self, name)
             if value is not None or name != "sigma_v":
@@ -170,15 +172,18 @@ class Dt:
             row = workspace.array(f"dt.row{k}", width * padded, dtype)
             if first and volume is None:
                 fresh = workspace.array(f"dt.cost{k}", width * padded, np.uint8)
-                _produce_rows(rows[k], blocks, guide, weights, y0, y1, fresh, row, costs)
+                with span("match", "sweep: rows with costs"):
+                    _produce_rows(rows[k], blocks, guide, weights, y0, y1, fresh, row, costs)
             else:
-                _filter_rows(blocks, guide, weights, y0, y1, row, costs)
+                with span("match", "sweep: rows"):
+                    _filter_rows(blocks, guide, weights, y0, y1, row, costs)
 
         def filter_bands(k: int, weights: Weights, last: bool) -> None:
             column = workspace.array(f"dt.band{k}", height * band * padded, dtype)
             state = workspace.array(f"dt.state{k}", band * padded, dtype)
             for x0, x1 in shares[k]:
-                _filter_band(blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep)
+                with span("match", "sweep: columns"):
+                    _filter_band(blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep)
 
         for number, weights in enumerate(passes):
             last = number == len(passes) - 1
@@ -194,16 +199,12 @@ def edge_weights() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return row, column
 
 
+@by_types
 def _feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     """Return ``value + weight * (before - keep * value)`` of int16 or float32 vectors; compiled code only.
 
     Fixed point rounds down.
     """
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_feed_back, strict=False, jit_options={"forceinline": True})
-def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     if value.scalar == types.int16:
         return lambda value, before, weight, keep: add(
             value, multiply_high(shift_left(subtract(before, value), 1), weight)
@@ -211,13 +212,9 @@ def _choose_feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     return lambda value, before, weight, keep: add(value, multiply(weight, subtract(before, multiply(keep, value))))
 
 
+@by_types
 def _feed_back_up(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     """Return what `_feed_back` does, but fixed point rounds up: the way back makes up for the way there."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_feed_back_up, strict=False, jit_options={"forceinline": True})
-def _choose_feed_back_up(value: Any, before: Any, weight: Any, keep: Any) -> Any:
     if value.scalar == types.int16:
         return lambda value, before, weight, keep: subtract(
             value, multiply_high(shift_left(subtract(value, before), 1), weight)
@@ -225,25 +222,17 @@ def _choose_feed_back_up(value: Any, before: Any, weight: Any, keep: Any) -> Any
     return lambda value, before, weight, keep: _feed_back(value, before, weight, keep)
 
 
-def _unpack(costs: Any, at: int, shift: int, like: Any) -> Any:
+@by_types
+def _unpack(costs: Any, at: Any, shift: Any, like: Any) -> Any:
     """64 costs of the volume in the type of `like`; compiled code only."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_unpack, strict=False, jit_options={"forceinline": True})
-def _choose_unpack(costs: Any, at: Any, shift: Any, like: Any) -> Any:
     if costs.dtype == types.uint8:
         return lambda costs, at, shift, like: shift_left(convert(load(costs, at), like), shift)
     return lambda costs, at, shift, like: load(costs, at)
 
 
-def _pack(costs: Any, at: int, value: Any, shift: int) -> None:
+@by_types
+def _pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
     """Put 64 costs into the volume, rounded to what it holds; compiled code only."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_pack, strict=False, jit_options={"forceinline": True})
-def _choose_pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
     if costs.dtype == types.uint8:
         # Half a step is added before the shift; the largest cost, 255, must not pass the byte.
         return lambda costs, at, value, shift: store(

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from stereokit.aggregation._paths import CHUNK, PathBuffers, Penalties, finish_part, first_visit, prepare_rows, start
 from stereokit.costs.rows import WORST, Cost, Levels
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer, check_number
+from stereokit.images.check import check_integer, check_number
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, load, store
 from stereokit.kernels.threads import run_stages
+from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import Winners, select_row
@@ -66,6 +67,8 @@ class Sgm:
     edge_factor: float = 0.5
     name: ClassVar[str] = "sgm"
     total_dtype: ClassVar[Any] = np.uint16
+    accepts_floats: ClassVar[bool] = False
+    cuda: ClassVar[str] = "stereokit.aggregation.sgm_cuda"
 
     def __post_init__(self) -> None:
         if check_integer("paths", self.paths) not in (4, 5, 8):
@@ -73,6 +76,16 @@ class Sgm:
         object.__setattr__(self, "paths", int(self.paths))
         check_number("edge", self.edge, 0, 1e6)
         check_number("edge_factor", self.edge_factor, 0, 1)
+
+    @classmethod
+    def fitting(cls, cost: Cost, defaults: dict[str, Any]) -> dict[str, Any]:
+        """Return changes to default options that a cost calls for: p2 takes no more than the cost leaves of 8 bits."""
+        p2 = defaults.get("p2")
+        return {} if p2 is None else {"p2": min(p2, (255 - cost.cost_max) / cost.unit)}
+
+    def check_cost(self, cost: Cost) -> None:
+        """Raise OptionError if the penalties do not go with a cost."""
+        self.penalties(cost.cost_max, cost.unit)
 
     def penalties(self, cost_max: int, unit: int) -> Penalties:
         """Return P1 and P2 in steps of cost.
@@ -132,11 +145,13 @@ class Sgm:
         middle = height // 2
 
         def first(k: int, y0: int, y1: int) -> None:
-            start(workers[k])
-            first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
+            with span("match", "sweep: first visit"):
+                start(workers[k])
+                first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
 
         def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
-            _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, keep)
+            with span("match", "sweep: last visit"):
+                _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, keep)
 
         run_stages(
             [

@@ -44,7 +44,7 @@ def match(
         Path,
         typer.Option("--output", "-o", metavar="FILE", help=".png (KITTI, x256), .pfm, .npy or .tiff."),
     ],
-    method: MethodOption = "zncc+sgm",
+    method: MethodOption = "census+sgm",
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements, pad_pair
-from stereokit.errors import OptionError
+from stereokit.errors import OptionError, shown
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, add, count_bits, either, less_bit, load, splat, store, xor
 from stereokit.kernels.threads import run, spans
@@ -57,10 +57,11 @@ class Census:
 
     window: str = "9x7"
     name: ClassVar[str] = "census"
+    cuda: ClassVar[str] = "stereokit.costs.census_cuda"
 
     def __post_init__(self) -> None:
         if not isinstance(self.window, str) or self.window not in WINDOWS:
-            raise OptionError(f"window of census must be one of {', '.join(WINDOWS)}, got {self.window!r}")
+            raise OptionError(f"window of census must be one of {', '.join(WINDOWS)}, got {shown(self.window)}")
 
     @property
     def cost_max(self) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 
 from stereokit.costs.rows import Pair, VolumeRows
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer
+from stereokit.images.check import check_integer
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
@@ -30,8 +30,9 @@ class RowCost:
     function : callable
         ``function(left, right, y, min_disparity, out)``, compiled with ``numba.njit(nogil=True)``. It writes the
         costs of row `y` into `out`, ``(W, D)`` ``uint8`` from 0 (equal) to `cost_max`; ``out[x, d]`` compares left
-        column ``x`` with right column ``x - d - min_disparity``. Images are ``(H, W)`` ``uint8`` or ``uint16``.
-        Cells whose right pixel lies outside the image need not be written.
+        column ``x`` with right column ``x - d - min_disparity``. Images are ``(H, W)`` ``uint8``, always: smoothed
+        ones are rounded, and those of 16 bits or floats have 256 levels over the range of both views. Cells whose
+        right pixel lies outside the image need not be written.
     cost_max : int
         Largest cost that it writes, 1 to 254.
     """
@@ -53,6 +54,11 @@ class RowCost:
     def unit(self) -> int:
         """Penalties are given in units of cost."""
         return 1
+
+    @property
+    def eight_bits(self) -> bool:
+        """Whether the images that it sees have 8 bits."""
+        return True
 
     @property
     def dear(self) -> bool:

@@ -47,6 +47,7 @@ __all__ = [
     "implements",
     "pad_pair",
     "produce_volume",
+    "takes_8_bits",
 ]
 
 WORST = np.uint8(255)
@@ -99,7 +100,17 @@ class Pair:
 
 
 class Cost(Protocol):
-    """What a matching cost offers: its range, the unit of its penalties, and rows."""
+    """What a matching cost offers: its range, the unit of its penalties, and rows.
+
+    It may further have
+
+    - ``cuda``: the name of the module with its CUDA twin, whose ``volume(queue, cost, scene)`` returns the volume of
+      costs on the device as `stereokit.costs.rows_cuda` has it, and whose ``check(cost)``, if it has one, raises
+      `stereokit.DeviceError` for options that the twin does not take. Without one, methods run on the CPU only;
+    - ``needs_ranges``: its costs depend on the smallest and largest values of the whole images (`Pair.ranges`), which
+      `stereokit.match_large` then looks for first;
+    - ``bytes_per_pixel``: memory that it takes beside its buffers.
+    """
 
     @property
     def name(self) -> str:
@@ -119,6 +130,11 @@ class Cost(Protocol):
 
     def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[Any]:
         """Prepare an image pair; return a row producer, a named tuple, for each of `workers` sweeps."""
+
+
+def takes_8_bits(cost: Any) -> bool:
+    """Return whether a cost is to see images of 8 bits only, smoothed or not: `RowCost` says so."""
+    return bool(getattr(cost, "eight_bits", False))
 
 
 class Cells(NamedTuple):

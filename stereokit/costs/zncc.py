@@ -30,13 +30,12 @@ from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_integer
-from stereokit.kernels.jit import inline, kernel
+from stereokit.images.check import check_integer
+from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import (
     LANES,
     add,
@@ -96,6 +95,9 @@ class Zncc:
     window: int = 5
     steps: int = 31
     name: ClassVar[str] = "zncc"
+    cuda: ClassVar[str] = "stereokit.costs.zncc_cuda"
+    needs_ranges: ClassVar[bool] = True
+    bytes_per_pixel: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
         window = check_integer("window", self.window, 3, 127)
@@ -314,13 +316,9 @@ def _start_sums(rows: ZnccRows, y: int) -> None:
                 _column(rows, (n * columns + c) * LANES, c, n * LANES)
 
 
-def _to_costs(rho: Any, steps: int, large: tuple[int, ...]) -> Any:
+@by_types
+def _to_costs(rho: Any, steps: Any, large: Any) -> Any:
     """Return ``steps - max(round(rho), 0)`` as bytes; compiled code only."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(_to_costs, strict=False, jit_options={"forceinline": True})
-def _choose_to_costs(rho: Any, steps: Any, large: Any) -> Any:
     # Adding this leaves the float's last bits no fraction: they hold the nearest integer, ties to even.
     magic = np.float32(1.5 * 2**23)
 

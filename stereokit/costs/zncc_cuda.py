@@ -21,7 +21,7 @@ from stereokit.cuda.kernel import Kernel, Queue, array, blocks_for, cuda, f32, i
 from stereokit.errors import DeviceError
 from stereokit.images.prepare_cuda import KINDS, clamped, ranges
 
-__all__ = ["LARGEST_WINDOW", "centre_kernel", "check_window", "costs_kernel", "statistics", "volume"]
+__all__ = ["LARGEST_WINDOW", "centre_kernel", "check", "costs_kernel", "statistics", "volume"]
 
 LARGEST_WINDOW = 11
 """Side of the largest window whose sums fit the registers."""
@@ -209,7 +209,7 @@ def statistics(
     return image, sums, scales
 
 
-def check_window(cost: Zncc) -> None:
+def check(cost: Zncc) -> None:
     """Raise DeviceError if the window is larger than `LARGEST_WINDOW`."""
     if cost.window > LARGEST_WINDOW:
         raise DeviceError(f"window of zncc must be at most {LARGEST_WINDOW} on device 'cuda', got {cost.window}")
@@ -223,7 +223,7 @@ def volume(queue: Queue, cost: Zncc, scene: Scene) -> Any:
     DeviceError
         If the window is larger than `LARGEST_WINDOW`.
     """
-    check_window(cost)
+    check(cost)
     height, width = scene.height, scene.width
     if scene.ranges is None:
         extremes = ranges(queue, scene.images, scene.dtype, height * width)

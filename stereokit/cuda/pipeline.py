@@ -8,55 +8,31 @@ are running gets a queue, with buffers, of its own.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereokit.aggregation.dt import Dt
-from stereokit.aggregation.dt_cuda import aggregate as aggregate_dt
-from stereokit.aggregation.sgm import Sgm
-from stereokit.aggregation.sgm_cuda import aggregate as aggregate_sgm
-from stereokit.costs import census_cuda, zncc_cuda
-from stereokit.costs.census import Census
-from stereokit.costs.rows import Cost, Levels
 from stereokit.costs.rows_cuda import Scene
-from stereokit.costs.zncc import Zncc
+from stereokit.cuda.dry import DryQueue
 from stereokit.cuda.kernel import Queue, blocks_for, cuda
 from stereokit.cuda.stream import DeviceQueue, stream_of
 from stereokit.errors import DeviceError, InputError
 from stereokit.images.gray import GrayPair
 from stereokit.images.prepare_cuda import flip, halve, smooth, take
-from stereokit.postprocess.chain import Chain
-from stereokit.postprocess.chain_cuda import post_process
+from stereokit.kernels.workspace import Pool
+from stereokit.pipeline import refined
+from stereokit.postprocess.chain_cuda import post_process, raise_to
 from stereokit.result import Disparity
 from stereokit.selection.wta_cuda import Maps, doubt
+from stereokit.settings import Detail, MatchSettings
 
-__all__ = ["CudaPipeline", "DeviceDisparity", "Settings"]
+__all__ = ["CudaPipeline", "DeviceDisparity"]
 
 Shape = tuple[int, int]
-
-
-class Settings(NamedTuple):
-    """What of the options of `stereokit.Matcher` the stages need, checked there."""
-
-    cost: Cost
-    aggregation: Any
-    levels: Levels  # of the size at which is matched
-    half: bool  # match at half size
-    smooth: float
-    outside: float | None
-    subpixel: bool
-    uniqueness: float
-    confidence: int  # 0 none, 1 the confidence, 2 the candidates too
-    right: bool
-    smp: bool
-    speckle: float
-    fill: str | None
-    median: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +115,13 @@ def new_queue(stream: Any) -> Any:
 
 
 class CudaPipeline:
-    """A matcher's way through the GPU; may be used by many threads at the same time.
+    """The way through the GPU (`stereokit.pipeline.Pipeline`); may be used by many threads at the same time.
 
     Parameters
     ----------
-    settings : Settings
-        Options.
-    refine : stereokit_refiners.contract.DeviceRefiner or None
-        What brings maps of half size to full size on the device; None where refiners run on the host.
+    settings : MatchSettings
+        Options. Costs and aggregations name the modules of their CUDA twins; a refiner with ``on_device`` serves
+        `match_on_device`.
 
     Raises
     ------
@@ -154,31 +129,35 @@ class CudaPipeline:
         If a stage has no CUDA kernels.
     """
 
-    def __init__(self, settings: Settings, refine: Any = None) -> None:
-        cost, aggregation = settings.cost, settings.aggregation
-        if not isinstance(cost, (Census, Zncc)):
-            raise DeviceError(f"cost must be census or zncc on device 'cuda', got {cost.name!r}")
-        if not isinstance(aggregation, (Sgm, Dt)):
-            raise DeviceError(f"aggregation must be sgm or dt on device 'cuda', got {aggregation.name!r}")
-        if isinstance(cost, Zncc):
-            zncc_cuda.check_window(cost)
-        self._settings = settings
-        self._refine = refine
-        self._free: dict[Any, deque[Any]] = {}
+    def __init__(self, settings: MatchSettings) -> None:
+        self.settings = settings
+        self._cost = _twin("cost", settings.cost)
+        self._aggregation = _twin("aggregation", settings.aggregation)
+        if hasattr(self._cost, "check"):
+            self._cost.check(settings.cost)
+        self._queues: dict[int | None, Pool[Any]] = {}
 
-    def host(self, pair: GrayPair) -> Disparity:
-        """Match a checked pair of the host.
+    def replaced(self, **changes: Any) -> CudaPipeline:
+        """Return a pipeline whose settings differ in some values."""
+        return CudaPipeline(self.settings.replaced(**changes))
 
-        Parameters
-        ----------
-        pair : GrayPair
-            At full size, also where it is matched at half size.
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+        """Return how many bytes of buffers a pair takes on the device; see `stereokit.pipeline.Pipeline`."""
+        queue = DryQueue()
+        dtype = np.dtype(dtype)
+        pixels = height * width
+        images = queue.array("images", 2 * pixels, dtype)
+        guide = images[:pixels] if dtype == np.uint8 else queue.array("guide", pixels, np.uint8)
+        bad = queue.array("bad", 2 * pixels, np.uint8)
+        self.run(queue, images, dtype, guide, bad, (height, width), None)
+        return float(queue.nbytes)
 
-        Returns
-        -------
-        Disparity
-            Of the size at which was matched, without the right view's map.
-        """
+    def match(self, pair: GrayPair, threads: int) -> Disparity:
+        """Match a checked pair of the host; see `stereokit.pipeline.Pipeline`."""
+        return refined(self.settings, self._coarse(pair), pair, threads)
+
+    def _coarse(self, pair: GrayPair) -> Disparity:
+        """Return the map of the size at which is matched."""
         with self._queue(None) as queue:
             height, width = shape = pair.left.shape
             dtype = pair.left.dtype
@@ -197,7 +176,7 @@ class CudaPipeline:
                 candidates = queue.fetch(found.candidates).reshape(2, *shape)
         return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence, candidates=candidates)
 
-    def device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
+    def match_on_device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
         """Match a pair that lies on the device, and wait for nothing.
 
         Parameters
@@ -214,9 +193,10 @@ class CudaPipeline:
         DeviceError
             If matching is at half size with a refiner that works on the host only, or memory is short.
         """
-        if self._settings.half and self._refine is None:
+        half = self.settings.scale != 1
+        if half and self._refine is None:
             raise DeviceError("refiner must be one with on_device for images on the device: linear, or a learned one")
-        if self._settings.half and self._settings.fill is None:
+        if half and self.settings.fill is None:
             raise DeviceError("fill must not be None for images on the device at half size: refiners need dense maps")
         views = _from_device("left", left), _from_device("right", right)
         if views[0].shape != views[1].shape:
@@ -225,15 +205,16 @@ class CudaPipeline:
         stream = cuda.default_stream() if stream is None else stream_of(stream)
         with self._queue(stream) as queue:
             found = self._match_views(queue, views, False, stream)
-            if not self._settings.half:  # what refiners return is new
+            if not half:  # what refiners return is new
                 found = _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
             other = None
-            if self._settings.right:
+            if self.settings.right:
                 mirrored = _flat(self._match_views(queue, views[::-1], True, stream).disparity)
                 out = queue.copy(mirrored)
                 queue.launch(flip, blocks_for(out.size, flip.block), mirrored, out, *shape)
                 other = _reshaped(out, shape)
-        return DeviceDisparity(*found[:3], other)
+        confidence = found.confidence if self.settings.confidence else None
+        return DeviceDisparity(found.disparity, found.valid, confidence, other)
 
     def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _Found:
         """Match two images on the device, or what a camera behind a mirror sees of them; at half size, refine."""
@@ -243,25 +224,24 @@ class CudaPipeline:
         for place, image in enumerate(views):
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
         found, size = self.run(queue, images, dtype, images[:pixels], None, shape)
-        if self._settings.half:
+        if self.settings.scale != 1:
             disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in found[:3])
             two = None if found.candidates is None else _reshaped(found.candidates, (2, *size))
             coarse = DeviceDisparity(disparity, valid, sure, candidates=two)
-            return _Found(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
+            full = _Found(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
+            if self.settings.floor is None:
+                return full
+            raised = _flat(full.disparity)
+            queue.launch(raise_to, blocks_for(pixels, raise_to.block), raised, self.settings.floor, pixels)
+            return full._replace(disparity=_reshaped(raised, shape))
         return found
 
     @contextmanager
     def _queue(self, stream: Any) -> Iterator[Any]:
         """Lend a queue on `stream`; None is a stream of the queue's own."""
-        free = self._free.setdefault(None if stream is None else int(stream), deque())
-        try:
-            queue = free.pop()
-        except IndexError:
-            queue = new_queue(stream)
-        try:
+        key = None if stream is None else int(stream)
+        with self._queues.setdefault(key, Pool(lambda: new_queue(stream))).take() as queue:
             yield queue
-        finally:
-            free.append(queue)
 
     def run(
         self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
@@ -286,8 +266,8 @@ class CudaPipeline:
         ranges : ((int, int), (int, int)) or None
             As of `stereokit.costs.rows.Pair`.
         """
-        settings = self._settings
-        if settings.half:
+        settings, levels = self.settings, self.settings.matched_levels
+        if settings.scale != 1:
             guide = halve(queue, "half.guide", guide, np.dtype(np.uint8), 1, shape, False)
             images = halve(queue, "half.images", images, dtype, 2, shape, False)
             if bad is not None:
@@ -298,35 +278,45 @@ class CudaPipeline:
         if settings.smooth > 0:
             images, dtype = smooth(queue, images, dtype, settings.smooth, shape), np.dtype(np.uint16)
         masks = queue.array("no.bad", 1, np.uint8) if bad is None else bad
-        scene = Scene(images, dtype, masks, bad is not None, height, width, settings.levels, settings.outside, ranges)
+        scene = Scene(images, dtype, masks, bad is not None, height, width, levels, settings.outside, ranges)
         if pixels * scene.padded >= 2**34:
             raise DeviceError(
                 f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * scene.padded}"
             )
-        confidence = queue.array("match.confidence", (0, 1, 3)[settings.confidence] * pixels or 1, np.float32)
+        confidence = queue.array("match.confidence", (0, 1, 3)[settings.detail] * pixels or 1, np.float32)
         maps = Maps(
             queue.array("match.disparity", pixels, np.float32),
             queue.array("match.cost", pixels, np.uint16 if not _floats(settings.aggregation) else np.float32),
             confidence,
-            settings.levels.count,
-            settings.levels.minimum,
+            levels.count,
+            levels.minimum,
             int(settings.subpixel),
             np.float32(settings.uniqueness / 100),
-            settings.confidence,
+            int(settings.detail),
         )
-        _aggregate(queue, settings, scene, guide, maps)
+        self._aggregate(queue, scene, guide, maps)
         candidates = None
-        if settings.confidence > 1:
+        if settings.detail >= Detail.CANDIDATES:
             confidence, candidates = confidence[:pixels], confidence[pixels:]
-        chain = Chain(
-            settings.smp, int(settings.speckle * pixels), settings.fill, settings.median, settings.levels.minimum
-        )
         left_bad = None if bad is None else bad[:pixels]
+        chain = settings.post_processing(pixels)
         disparity, valid = post_process(queue, maps.disparity, maps.cost, left_bad, chain, shape)
-        if not settings.confidence:
+        if settings.detail == Detail.DISPARITY:
             return _Found(disparity, valid), shape
         queue.launch(doubt, blocks_for(pixels, doubt.block), confidence, valid, pixels)
         return _Found(disparity, valid, confidence, candidates), shape
+
+    def _aggregate(self, queue: Queue, scene: Scene, guide: Any, maps: Maps) -> None:
+        """Compute the costs, aggregate them and select."""
+        cost, aggregation = self.settings.cost, self.settings.aggregation
+        volume = self._cost.volume(queue, cost, scene)
+        shape = scene.height, scene.width
+        self._aggregation.aggregate(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)
+
+    @property
+    def _refine(self) -> Any:
+        """What refines on the device, `stereokit_refiners.contract.DeviceRefiner`, or None."""
+        return getattr(self.settings.refiner, "on_device", None)
 
 
 def _floats(aggregation: Any) -> bool:
@@ -334,16 +324,9 @@ def _floats(aggregation: Any) -> bool:
     return bool(np.dtype(aggregation.total_dtype).kind == "f")
 
 
-def _aggregate(queue: Queue, settings: Settings, scene: Scene, guide: Any, maps: Maps) -> None:
-    """Compute the costs, aggregate them and select."""
-    cost, aggregation = settings.cost, settings.aggregation
-    shape = scene.height, scene.width
-    if isinstance(cost, Census):
-        volume = census_cuda.volume(queue, cost, scene)
-    else:
-        assert isinstance(cost, Zncc)
-        volume = zncc_cuda.volume(queue, cost, scene)
-    if isinstance(aggregation, Sgm):
-        aggregate_sgm(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)
-        return
-    aggregate_dt(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)
+def _twin(kind: str, stage: Any) -> Any:
+    """Return the module with the CUDA twin of a stage; raise DeviceError if it has none."""
+    module = getattr(stage, "cuda", None)
+    if module is None:
+        raise DeviceError(f"{kind} {stage.name!r} has no CUDA kernels: it cannot run on device 'cuda'")
+    return import_module(module)

@@ -1,8 +1,8 @@
 """CUDA twins of what happens to images before matching: grey, half size, Gaussian; and their ranges.
 
-All are integers and equal `stereokit.images.gray` to the last bit. OpenCV makes grey with 15-bit weights, rounds the
-mean of four pixels half up, and blurs 16-bit images with 16-bit weights and one rounding at the end; its weights are
-asked of OpenCV itself, by blurring an impulse.
+All are integers and equal `stereokit.images.gray` and `stereokit.images.resize` to the last bit. OpenCV makes grey
+with 15-bit weights, rounds the mean of four pixels half up, and blurs 16-bit images with 16-bit weights and one
+rounding at the end; its weights are asked of OpenCV itself, by blurring an impulse.
 
 The two images of a pair lie behind one another in one array, ``(2, H, W)`` flat, so that each stage is one launch.
 """
@@ -259,7 +259,7 @@ def halve(
 
 
 def smooth(queue: Queue, images: Any, dtype: np.dtype[Any], sigma: float, shape: tuple[int, int]) -> Any:
-    """Return both images blurred, 16 bit, as `stereokit.images.gray.smooth` does; `sigma` is above 0."""
+    """Return both images blurred, 16 bit, as `stereokit.images.resize.smooth` does; `sigma` is above 0."""
     height, width = shape
     size = 2 * height * width
     weights = queue.once("smooth.weights", sigma, lambda: gaussian_weights(sigma))

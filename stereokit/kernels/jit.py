@@ -1,7 +1,7 @@
 """The one home of numba's flags.
 
-Every kernel is compiled on first use for the types that it meets, kept in numba's disk cache, releases the
-interpreter lock so that plain threads run it side by side, and divides as numpy does (no zero-division
+Every kernel is compiled on first use for the types that it meets, kept on disk (`stereokit.kernels.cache`), releases
+the interpreter lock so that plain threads run it side by side, and divides as numpy does (no zero-division
 exception inside loops). There is no ``fastmath``: results must not depend on the processor. There is no
 ``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.threads` runs
 several of them at once, which is safe from any number of calling threads and compiles in half the time.
@@ -14,19 +14,28 @@ an upgrade, or an edit anywhere, nothing stale is ever loaded.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from numba.extending import overload
 
-__all__ = ["FINGERPRINT", "inline", "kernel"]
+from stereokit.kernels.cache import cache_of
+
+__all__ = ["CHECKED", "FINGERPRINT", "by_types", "inline", "kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+CHECKED = os.environ.get("STEREOKIT_CHECKED", "0") not in ("", "0")
+"""Whether kernels check each access to an array; one outside of it ends the process. For tests: slow to compile."""
+
+
 def _fingerprint() -> str:
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(b"checked" if CHECKED else b"")
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
@@ -38,13 +47,15 @@ FINGERPRINT = _fingerprint()
 
 # Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
 # a pixel; for the same reason kernels cannot allocate: buffers come in as arguments.
-_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "boundscheck": CHECKED}
 
 
 def kernel(function: F) -> F:
     """Compile `function` as a kernel that Python code calls."""
     function.__qualname__ = f"{function.__qualname__}_{FINGERPRINT}"
-    compiled: F = numba.njit(cache=True, **_FLAGS)(function)
+    compiled: F = numba.njit(**_FLAGS)(function)
+    if hasattr(compiled, "_cache"):  # not where NUMBA_DISABLE_JIT is set
+        compiled._cache = cache_of(function)
     return compiled
 
 
@@ -52,3 +63,17 @@ def inline(function: F) -> F:
     """Compile `function` as a helper that kernels call and that is always inlined into them."""
     compiled: F = numba.njit(forceinline=True, **_FLAGS)(function)
     return compiled
+
+
+def by_types(choose: F) -> F:
+    """Make a helper whose code depends on the types of its arguments, always inlined into the kernels that call it.
+
+    `choose` is called with numba's types when a kernel is compiled, and returns the function to compile for them.
+    """
+
+    @wraps(choose)
+    def stub(*arguments: Any) -> Any:
+        raise NotImplementedError("compiled code only")
+
+    overload(stub, strict=False, jit_options={"forceinline": True})(choose)
+    return stub  # type: ignore[return-value]

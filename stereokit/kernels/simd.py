@@ -5,7 +5,8 @@ what the processor has (two registers of AVX2, four of NEON or SSE), so there is
 everywhere: the integer operations are exact and the float ones are single IEEE operations, never contracted.
 
 The functions of this module can be called from compiled code only. They take flat arrays and offsets in
-elements; nothing checks bounds.
+elements. Nothing checks bounds but a build with ``STEREOKIT_CHECKED=1``, whose accesses outside of an array end the
+process.
 
 Layout of a row of costs or path costs (one row of the image, `W` pixels, `D` disparity levels padded to
 ``P = 64 * ceil(D / 64)``)::
@@ -25,6 +26,8 @@ from llvmlite import binding, ir
 from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
+
+from stereokit.kernels.jit import CHECKED
 
 __all__ = [
     "LANES",
@@ -126,9 +129,22 @@ def _call(builder: Any, name: str, result: Any, args: list[Any]) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, signature, name), args)
 
 
+def _element(context: Any, builder: Any, kind: Any, array: Any, offset: Any, count: int) -> Any:
+    """Return the address of element `offset`, the first of `count`; a checked build traps where one is outside."""
+    content = context.make_array(kind)(context, builder, array)
+    if CHECKED:
+        last = builder.sub(content.nitems, ir.Constant(content.nitems.type, count))
+        inside = builder.and_(
+            builder.icmp_signed(">=", offset, ir.Constant(offset.type, 0)), builder.icmp_signed("<=", offset, last)
+        )
+        with cgutils.if_unlikely(builder, builder.not_(inside)):
+            _call(builder, "llvm.trap", ir.VoidType(), [])
+    return builder.gep(content.data, [offset])
+
+
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, offset: Any) -> Any:
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [offset]), ir.PointerType(Vector(kind.dtype).llvm))
+    element = _element(context, builder, kind, array, offset, LANES)
+    return builder.bitcast(element, ir.PointerType(Vector(kind.dtype).llvm))
 
 
 @intrinsic
@@ -220,8 +236,8 @@ def splat_at(typing: Any, array: Any, offset: Any) -> Any:
     kind = Vector(array.dtype)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        return _splat_ir(builder, builder.load(builder.gep(data, [args[1]])), kind)
+        element = _element(context, builder, signature.args[0], args[0], args[1], 1)
+        return _splat_ir(builder, builder.load(element), kind)
 
     return kind(array, types.intp), generate
 

@@ -1,6 +1,6 @@
 """Buffers that are kept from one call to the next.
 
-A matcher owns a `Pool`. Each call takes a `Workspace` out, and puts it back when it ends, so that calls from
+A matcher owns a `Pool`. Each call takes a `Workspace` out, and puts it back when it ends well, so that calls from
 several threads never share a buffer and a steady stream of equal frames allocates nothing.
 """
 
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
-from typing import Any, TypeVar
+from contextlib import contextmanager, suppress
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -19,6 +19,11 @@ from stereokit.kernels.simd import aligned
 __all__ = ["Pool", "Workspace"]
 
 T = TypeVar("T")
+
+_MOST_FREE = 4
+"""What a pool keeps for later calls at the same time."""
+_LOANS_UNUSED = 8
+"""Loans after which a pool lets go of what none of them needed."""
 
 
 class Workspace:
@@ -31,40 +36,66 @@ class Workspace:
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray[Any, Any]:
         """Return the array called `name`, C-contiguous and 64-byte aligned; its content is whatever it was."""
         shape = (shape,) if isinstance(shape, int) else shape
-        held = self._arrays.get(name)
-        if held is None or held.shape != shape or held.dtype != np.dtype(dtype):
-            self._arrays.pop(name, None)  # free the old one before the new one is made
-            held = self._arrays[name] = aligned(shape, dtype)
-        return held
+        array = self._arrays.get(name)
+        if array is None or array.shape != shape or array.dtype != np.dtype(dtype):
+            del array  # free the old one before the new one is made
+            self._arrays.pop(name, None)
+            array = self._arrays[name] = aligned(shape, dtype)
+        return array
 
     def once(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
         """Return what `make` returned when `name` was last asked for, if that was with the same `key`."""
-        held = self._made.get(name)
-        if held is None or held[0] != key:
-            held = self._made[name] = key, make()
-        made: T = held[1]
-        return made
+        entry = self._made.get(name)
+        if entry is None or entry[0] != key:
+            entry = self._made[name] = key, make()
+        value: T = entry[1]
+        return value
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """Bytes of all arrays."""
         return sum(a.nbytes for a in self._arrays.values())
 
 
-class Pool:
-    """Workspaces of one matcher: as many as there were calls at the same time."""
+class Pool(Generic[T]):
+    """What calls borrow, made when nothing is free: workspaces of a matcher, queues of a GPU, requests of a network.
 
-    def __init__(self) -> None:
-        self._free: deque[Workspace] = deque()  # its pop and append need no lock, which a fork could leave held
+    Parameters
+    ----------
+    make : callable
+        Makes one.
+    """
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make = make
+        # Pairs of one and the number of loans when it came back, the latest last. The operations of a deque need no
+        # lock, which a fork could leave held.
+        self._free: deque[tuple[T, int]] = deque()
+        self._loans = 0
 
     @contextmanager
-    def take(self) -> Iterator[Workspace]:
-        """Lend a workspace for the length of a ``with`` block."""
+    def take(self) -> Iterator[T]:
+        """Lend one for the length of a ``with`` block.
+
+        What was lent to a block that raises is never lent again: a thread that was not waited for may still write to
+        it.
+        """
         try:
-            workspace = self._free.pop()
+            one, _ = self._free.pop()
         except IndexError:
-            workspace = Workspace()
-        try:
-            yield workspace
-        finally:
-            self._free.append(workspace)
+            one = self._make()
+        self._loans += 1
+        yield one
+        self._free.append((one, self._loans))
+        self._trim()
+
+    def _trim(self) -> None:
+        """Let go of what a burst of calls has left: all but a few, and what nobody has needed for some calls."""
+        with suppress(IndexError):  # others may take meanwhile
+            while len(self._free) > _MOST_FREE or self._loans - self._free[0][1] > _LOANS_UNUSED:
+                self._free.popleft()
+
+    @property
+    def free(self) -> list[T]:
+        """What waits to be lent."""
+        return [one for one, _ in self._free]

@@ -7,16 +7,16 @@ refiner, and stay within the window.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.kernels.workspace import Workspace
+from stereokit.images.intensity import Tone
 from stereokit.large.plan import Cut, Plan
 from stereokit.large.sources import Source
-from stereokit.large.tones import Ranges, Tone, read_pair
+from stereokit.large.tones import Ranges, read_pair
 from stereokit.matching import Matcher
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows
@@ -53,8 +53,7 @@ class Bands:
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
         self._matcher = _for_windows(matcher, (self._height, self._width), windows.window)
-        self._halo = matcher.median // 2 if matcher.refiner is None else 0
-        self._workspace = Workspace()
+        self._halo = matcher.settings.median // 2 if matcher.refiner is None else 0
         self._last: NDArray[np.float32] | None = None  # row that a band without any valid pixel is filled from
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
@@ -78,35 +77,34 @@ class Bands:
         """Match one window and put what is kept of it into a band that begins at row `top`."""
         window = row.start, row.stop, column.start, column.stop
         pair = read_pair(*self._sources, self._tone, window, self._ranges)
-        found = self._matcher.match_gray(pair, self._workspace, self._matcher.threads)
+        found = self._matcher.match_gray(pair, self._matcher.threads)
         kept = slice(column.first - column.start, column.last - column.start)
         rows = slice(top - row.start, top - row.start + len(band))
         band[:, column.first : column.last] = found.disparity[rows, kept]
         self.measured += int(np.count_nonzero(found.valid[row.first - row.start : row.last - row.start, kept]))
 
     def _finished(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
-        matcher = self._wanted
-        if matcher.refiner is not None:
+        settings = self._wanted.settings
+        if settings.refiner is not None:
             return band
-        filled = matcher.fill is not None
+        filled = settings.fill is not None
         if filled:
-            if fill_rows(band, 0, len(band), matcher.fill == "nearest") and not fill_empty_rows(band):
-                band[:] = matcher.min_disparity if self._last is None else self._last
+            if fill_rows(band, 0, len(band), settings.fill == "nearest") and not fill_empty_rows(band):
+                band[:] = settings.levels.minimum if self._last is None else self._last
             self._last = band[-1].copy()
-        if matcher.median == 0:
+        if settings.median == 0:
             return band
         out = np.empty_like(band)
-        median_rows(band, matcher.median, 0, len(band), out, dense=filled)
+        median_rows(band, settings.median, 0, len(band), out, dense=filled)
         return out
 
 
 def _for_windows(matcher: Matcher, image: tuple[int, int], window: tuple[int, int]) -> Matcher:
     """Return a matcher whose largest speckle has as many pixels as in the whole image, and that leaves filling."""
-    step = round(1 / matcher.scale)
+    step = matcher.settings.step
     whole, part = (-(-height // step) * -(-width // step) for height, width in (image, window))
-    changed = copy.copy(matcher)
-    if matcher.speckle:
-        changed.speckle = (int(matcher.speckle * whole) + 0.5) / part
+    speckle = matcher.settings.speckle
+    changes: dict[str, Any] = {"speckle": min(1.0, (int(speckle * whole) + 0.5) / part)} if speckle else {}
     if matcher.refiner is None:
-        changed.fill, changed.median = None, 0
-    return changed
+        changes.update(fill=None, median=0)
+    return matcher.replaced(**changes)

@@ -16,18 +16,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stereokit.costs import Zncc
-from stereokit.errors import InputError, OptionError
-from stereokit.images.gray import GrayPair, check_integer
-from stereokit.kernels.workspace import Workspace
+import numpy as np
+
+from stereokit.errors import OptionError
+from stereokit.images.check import check_integer
+from stereokit.images.gray import check_same
+from stereokit.images.intensity import Tone
 from stereokit.large.bands import Bands
-from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes, window_model
+from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes
 from stereokit.large.output import check_large_output, write_bands
 from stereokit.large.plan import Plan, plan
 from stereokit.large.sources import Source, open_source
-from stereokit.large.tones import BLOCK_NBYTES, Ranges, Tone, find_ranges, find_tone
+from stereokit.large.tones import BLOCK_NBYTES, Ranges, find_ranges, tone_of
 from stereokit.matching import Matcher
-from stereokit.result import Disparity
 
 __all__ = ["OVERLAP", "LargeResult", "match_large"]
 
@@ -95,7 +96,7 @@ def match_large(
     left: Any,
     right: Any,
     output: str | os.PathLike[str],
-    method: str = "zncc+sgm",
+    method: str = "census+sgm",
     *,
     memory: int | float | str | None = None,
     overlap: int = OVERLAP,
@@ -142,13 +143,13 @@ def match_large(
     matcher = Matcher(method, **options)
     limit = None if memory is None else parse_memory(memory)
     sources = open_source("left", left), open_source("right", right)
-    _check_pair(*sources)
-    tone = find_tone(*sources)
+    check_same(*sources)
+    tone = tone_of(*sources, matcher.settings.nodata)
     height, width = sources[0].shape[:2]
     windows = _plan(matcher, sources, tone, overlap, limit, target)
     ranges: Ranges | None = None
-    if isinstance(matcher.cost, Zncc):  # its grey levels depend on the range of the whole image
-        ranges = find_ranges(*sources, tone, round(1 / matcher.scale), matcher.smooth, matcher.threads)
+    if getattr(matcher.cost, "needs_ranges", False):
+        ranges = find_ranges(*sources, tone, matcher.settings.step, matcher.settings.smooth, matcher.threads)
     bands = Bands(matcher, sources, tone, ranges, windows, progress)
     write_bands(target, height, width, bands)
     total = len(windows.rows) * len(windows.columns)
@@ -156,29 +157,19 @@ def match_large(
     return LargeResult(target, height, width, windows.window, total, overlap, density, matcher)
 
 
-def _check_pair(left: Source, right: Source) -> None:
-    if left.dtype != right.dtype:
-        raise InputError(f"left and right must have the same type, got {left.dtype} and {right.dtype}")
-    if left.shape[:2] != right.shape[:2]:
-        raise InputError(f"left and right must have the same size, got {left.shape[:2]} and {right.shape[:2]}")
-
-
 def _plan(
     matcher: Matcher, sources: tuple[Source, Source], tone: Tone, overlap: int, limit: int | None, target: Path
 ) -> Plan:
-    def match(pair: GrayPair, workspace: Workspace) -> Disparity:
-        return matcher.match_gray(pair, workspace, matcher.threads)
-
-    buffers = window_model(match, tone.kind)
     height, width = sources[0].shape[:2]
     size = tone.kind.itemsize
-    pixel = 2 * size + (size > 1) + 2 * (sources[0].dtype.kind == "f") + 5  # both images, guide, masks, the map
-    pixel += 4 * isinstance(matcher.cost, Zncc)  # the images once more
+    masked = tone.nodata is not None or sources[0].dtype != np.uint8 or any(s.shape[2:] == (4,) for s in sources)
+    pixel = 2 * size + (size > 1) + 2 * masked + 5  # both images, guide, masks, the map
+    pixel += getattr(matcher.cost, "bytes_per_pixel", 0)
     pixel += _refiner_nbytes(matcher)
     band = 4 * width * (2 if target.suffix.lower() == ".npy" else 4)  # before and after the median, and as tiles
 
     def needed(rows: int, columns: int) -> float:
-        return buffers(rows, columns) + pixel * rows * columns + band * rows
+        return matcher.nbytes(rows, columns, tone.kind) + pixel * rows * columns + band * rows
 
     used = resident_nbytes()
     limit = used + free_nbytes() // 2 if limit is None else limit

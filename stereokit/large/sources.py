@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError
-from stereokit.images.gray import checked_image
+from stereokit.images.check import checked_image
 from stereokit.io import read_image
 
 __all__ = ["Source", "open_source"]

@@ -100,11 +100,11 @@ def post_process(
         if chain.fill is not None and fill_rows(disparity, y0, y1, chain.fill == "nearest"):
             incomplete.append(y0)
 
-    def smooth_rows(y0: int, y1: int) -> None:
+    def smooth_rows(k: int, y0: int, y1: int) -> None:
         if incomplete:
             return
         if chain.median:
-            median_rows(disparity, chain.median, y0, y1, out, workspace, chain.fill is not None)
+            median_rows(disparity, chain.median, y0, y1, out, workspace, chain.fill is not None, k)
         else:
             out[y0:y1] = disparity[y0:y1]
 
@@ -112,7 +112,7 @@ def post_process(
     if chain.speckle and len(parts) > 1:
         stages.append([join])
     stages.append([partial(clean, y0, y1) for y0, y1 in parts])
-    stages.append([partial(smooth_rows, y0, y1) for y0, y1 in parts])
+    stages.append([partial(smooth_rows, k, y0, y1) for k, (y0, y1) in enumerate(parts)])
     run_stages(stages, threads)
     if incomplete:  # rare: rows without any valid pixel take those of others
         incomplete.clear()

@@ -13,7 +13,7 @@ from stereokit.postprocess.median_cuda import median
 from stereokit.postprocess.smp_cuda import resolve
 from stereokit.postprocess.speckle_cuda import remove
 
-__all__ = ["post_process"]
+__all__ = ["post_process", "raise_to"]
 
 
 @kernel(array(f32), array(u8), u32)
@@ -22,6 +22,14 @@ def invalidate(disparity, bad, pixels):  # type: ignore[no-untyped-def]
     at = u32(cuda.grid(1))
     if at < pixels and bad[at] != u8(0):
         disparity[at] = f32(np.nan)
+
+
+@kernel(array(f32), f32, u32)
+def raise_to(disparity, low, pixels):  # type: ignore[no-untyped-def]
+    """Raise what lies below the lowest disparity to it; NaN stays."""
+    at = u32(cuda.grid(1))
+    if at < pixels and disparity[at] < low:
+        disparity[at] = low
 
 
 def post_process(

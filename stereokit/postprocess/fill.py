@@ -13,7 +13,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, UnknownNameError, did_you_mean
+from stereokit.errors import UnknownNameError, did_you_mean
+from stereokit.images.maps import check_threads, checked_map
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.threads import run, spans
 
@@ -42,14 +43,13 @@ def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: i
     ------
     UnknownNameError
         If there is no such mode.
-    InputError
-        If the map is not two-dimensional.
+    InputError, OptionError
+        If the map is not (H, W) numbers, or `threads` is none.
     """
-    if mode not in FILLS:
+    if not isinstance(mode, str) or mode not in FILLS:
         raise UnknownNameError(did_you_mean("fill", str(mode), FILLS))
-    if disparity.ndim != 2:
-        raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
-    out = np.array(disparity, np.float32, order="C")
+    threads = check_threads(threads)
+    out = checked_map(disparity)
     nearest = mode == "nearest"
     parts = spans(out.shape[0], threads)
     run([partial(fill_rows, out, y0, y1, nearest) for y0, y1 in parts], threads)

@@ -14,7 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, OptionError
+from stereokit.errors import OptionError, shown
+from stereokit.images.check import check_integer
+from stereokit.images.maps import checked_map
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, load, maximum, minimum, store
 from stereokit.kernels.workspace import Workspace
@@ -40,13 +42,11 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
     OptionError
         If the size is another.
     InputError
-        If the map is not two-dimensional.
+        If the map is not (H, W) numbers.
     """
-    if size not in (3, 5):
-        raise OptionError(f"size of the median must be 3 or 5, got {size!r}")
-    if disparity.ndim != 2:
-        raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
-    source = np.ascontiguousarray(disparity, np.float32)
+    if check_integer("size of the median", size) not in (3, 5):
+        raise OptionError(f"size of the median must be 3 or 5, got {shown(size)}")
+    source = checked_map(disparity)
     out = np.empty_like(source)
     median_rows(source, size, 0, source.shape[0], out)
     return out
@@ -54,11 +54,11 @@ def median(disparity: NDArray[np.float32], size: int = 3) -> NDArray[np.float32]
 
 def median_rows(
     source: NDArray[np.float32], size: int, y0: int, y1: int, out: NDArray[np.float32],
-    workspace: Workspace | None = None, dense: bool = False,
+    workspace: Workspace | None = None, dense: bool = False, band: int = 0,
 ) -> None:  # fmt: skip
     """Write rows y0..y1 of the filtered map to `out`; the same values however the rows are cut into ranges.
 
-    `dense` promises that no pixel is NaN.
+    `dense` promises that no pixel is NaN; `band` is another number for each range that is filtered at the same time.
     """
     half = size // 2
     top, bottom = max(y0 - half, 0), min(y1 + half, source.shape[0])
@@ -77,9 +77,9 @@ def median_rows(
     elif top == y0 and bottom == y1:
         cv2.medianBlur(part, size, dst=out[y0:y1])
     else:
-        held = np.empty_like(part) if workspace is None else workspace.array(f"median.{y0}", part.shape, np.float32)
-        cv2.medianBlur(part, size, dst=held)
-        out[y0:y1] = held[y0 - top : y1 - top]
+        wide = np.empty_like(part) if workspace is None else workspace.array(f"median.{band}", part.shape, np.float32)
+        cv2.medianBlur(part, size, dst=wide)
+        out[y0:y1] = wide[y0 - top : y1 - top]
 
 
 @lru_cache(maxsize=2)

@@ -15,10 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
+from stereokit.images.maps import check_threads, checked_map, numbers
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.threads import run, spans
 
 __all__ = ["resolve_rows", "right_column", "single_matching_phase"]
+
+
+_COSTS = (np.uint16, np.int16, np.float32)
 
 
 def single_matching_phase(
@@ -40,13 +44,15 @@ def single_matching_phase(
 
     Raises
     ------
-    InputError
-        If the two differ in shape.
+    InputError, OptionError
+        If the two are not numbers of one shape, or `threads` is none.
     """
-    if disparity.ndim != 2 or disparity.shape != cost.shape:
-        raise InputError(f"cost must have the shape of disparity {disparity.shape}, got {cost.shape}")
-    out = np.array(disparity, np.float32, order="C")
-    cost = np.ascontiguousarray(cost)
+    threads = check_threads(threads)
+    out = checked_map(disparity)
+    cost = numbers("cost", cost)
+    if out.shape != cost.shape:
+        raise InputError(f"cost must have the shape of disparity {out.shape}, got {cost.shape}")
+    cost = np.ascontiguousarray(cost, None if cost.dtype in _COSTS else np.float64)
     parts = spans(out.shape[0], threads)
     owners = np.empty((len(parts), out.shape[1]), np.int32)
     run([partial(resolve_rows, out, cost, y0, y1, owners[k]) for k, (y0, y1) in enumerate(parts)], threads)

@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError
-from stereokit.images.gray import check_integer, check_number
+from stereokit.images.check import check_integer, check_number
+from stereokit.images.maps import check_threads, checked_map
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
@@ -47,15 +47,17 @@ def remove_speckles(
     Raises
     ------
     InputError, OptionError
-        If the map is not two-dimensional, or an option breaks its rule.
+        If the map is not (H, W) numbers, or an option breaks its rule.
     """
-    if disparity.ndim != 2:
-        raise InputError(f"disparity must be (H, W), got shape {disparity.shape}")
+    threads = check_threads(threads)
     size = check_integer("size", size, 0)
     limit = np.float32(check_number("difference", difference, 0, 1e6))
-    out = np.array(disparity, np.float32, order="C")
-    held = workspace or Workspace()
-    label, parent, count = (held.array(f"speckle.{name}", out.size, np.int32) for name in ("label", "parent", "count"))
+    out = checked_map(disparity)
+    size = min(size, out.size)
+    buffers = workspace or Workspace()
+    label, parent, count = (
+        buffers.array(f"speckle.{name}", out.size, np.int32) for name in ("label", "parent", "count")
+    )
     width = out.shape[1]
     flat = out.reshape(-1)
     parts = spans(out.shape[0], threads)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.images.gray import MAX_DISPARITY, check_flag, check_integer
+from stereokit.images.check import MAX_DISPARITY, check_flag, check_integer
+from stereokit.images.maps import numbers
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.simd import LANES, choose, first_bit, load, lowest, mask_equal, minimum, splat
 
@@ -150,7 +151,8 @@ def select(
     Parameters
     ----------
     volume : (H, W, D) uint16, int16 or float32, not negative
-        Aggregated costs, as `stereokit.aggregate` returns them.
+        Aggregated costs, as `stereokit.aggregate` returns them. NaN and infinity say nothing of a level: it does not
+        win, and what wins next to it is not interpolated.
     min_disparity : int
         Disparity of level 0, pixels.
     subpixel : bool
@@ -159,8 +161,9 @@ def select(
     Returns
     -------
     disparity : (H, W) float32, pixels
+        Within the levels; NaN where all costs are NaN or infinite.
     cost : (H, W), dtype of the volume
-        Aggregated cost of the winner.
+        Aggregated cost of the winner; NaN where there is none.
     confidence : (H, W) float32 in [0, 1]
 
     Raises
@@ -168,7 +171,7 @@ def select(
     InputError, OptionError
         If the volume has another shape or type, or an option breaks its rule.
     """
-    volume = np.asarray(volume)
+    volume = numbers("volume", volume)
     low = check_integer("min_disparity", min_disparity, -MAX_DISPARITY, MAX_DISPARITY)
     check_flag("subpixel", subpixel)
     if volume.ndim != 3 or volume.dtype not in (np.uint16, np.int16, np.float32) or 0 in volume.shape:
@@ -185,10 +188,27 @@ def select(
     blocks = tuple(range(padded // LANES))
     row = np.full((width, padded), worst, volume.dtype)
     for y in range(height):
-        row[:, :count] = volume[y]
+        known = np.isfinite(volume[y])
+        row[:, :count] = np.where(known, volume[y], worst) + volume.dtype.type(0)  # no -0, whose bits are the lowest
+        if row.min() < 0:
+            raise InputError(f"volume must not be negative, got {row.min()}")
         values = row.ravel()
         select_row(keys_of(values), values, width, blocks, y * width, out)
+        if not known.all():
+            _amend(known, row.argmin(axis=1), low, disparity[y], cost[y], confidence[y])
     return disparity, cost, confidence
+
+
+def _amend(
+    known: NDArray[np.bool_], best: NDArray[np.intp], low: int, disparity: NDArray[np.float32], cost: NDArray[Any],
+    confidence: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Take from the pixels of a row what comes of levels without a cost."""
+    beside = np.stack([np.clip(best - 1, 0, None), np.clip(best + 1, None, known.shape[1] - 1)], axis=1)
+    alone = ~np.take_along_axis(known, beside, axis=1).all(axis=1)
+    disparity[alone] = best[alone] + low
+    nothing = ~known.any(axis=1)
+    disparity[nothing], cost[nothing], confidence[nothing] = np.nan, np.nan, 0
 
 
 def keys_of(values: NDArray[Any]) -> NDArray[Any]:

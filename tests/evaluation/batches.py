@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import typer
+from limits import HANG_S
 from typer.testing import CliRunner
 
 from stereokit.errors import StereokitError
@@ -68,7 +69,7 @@ def environment():
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
-def wait_for(condition, process=None, seconds=300):
+def wait_for(condition, process=None, seconds=HANG_S):
     """Wait until `condition` holds; fail if the process ends before, or it takes too long."""
     end = time.monotonic() + seconds
     while not condition():

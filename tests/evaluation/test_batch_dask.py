@@ -10,6 +10,7 @@ import sys
 
 import pytest
 from batches import environment, images, inodes, refused, run, start, wait_for, write_pairs
+from limits import HANG_S
 
 from stereokit.io import read_disparity
 from stereokit_evaluation.batch.dask import connect, on_cluster
@@ -114,7 +115,7 @@ def test_a_scheduler_that_dies_ends_the_batch_with_one_line(tmp_path):
         process = start(tmp_path, "-o", out, "--engine", "dask", "--scheduler", where, folder=tmp_path)
         wait_for(lambda: len(inodes(out)) >= 3, process)
         scheduler.kill()
-        assert process.wait(120) == 2
+        assert process.wait(HANG_S) == 2
     told = [line for line in (tmp_path / "stderr").read_text().splitlines() if line.startswith("error: ")]
     assert len(told) == 1 and "the Dask scheduler was lost" in told[0]
     before = inodes(out)

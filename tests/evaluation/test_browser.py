@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from limits import HANG_S
 
 from stereokit.calibration import Calibration
 from stereokit_evaluation.report import viewer
@@ -103,9 +104,9 @@ def opened(chromium, path, size="desktop", scheme="light"):
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.append(request.url[:60]))
     page.goto(path.as_uri())
-    page.wait_for_selector("#viewer[data-ready]", timeout=20_000)
+    page.wait_for_selector("#viewer[data-ready]", timeout=1000 * HANG_S)
     if page.query_selector("#charts"):
-        page.wait_for_selector("body[data-charts]", timeout=20_000)
+        page.wait_for_selector("body[data-charts]", timeout=1000 * HANG_S)
     yield page
     if folder := os.environ.get("STEREOKIT_SCREENSHOTS"):
         Path(folder).mkdir(parents=True, exist_ok=True)

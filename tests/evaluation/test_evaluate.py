@@ -36,11 +36,11 @@ def constant(value, missing=()):
 
 
 class FakeMatcher:
-    """Stands in for `stereokit.Matcher`: disparity 10 by zncc+sgm, 20 by anything else."""
+    """Stands in for `stereokit.Matcher`: disparity 10 by semi-global methods, 20 by anything else."""
 
     made: list[dict] = []  # noqa: RUF012
 
-    def __init__(self, method="zncc+sgm", *, max_disparity=128, scale=1.0, refiner=None, device="auto", **rest):
+    def __init__(self, method="census+sgm", *, max_disparity=128, scale=1.0, refiner=None, device="auto", **rest):
         if method == "nonsense":
             raise UnknownNameError("no cost named 'nonsense'")
         self.method, self.device = {"S4": "zncc+sgm"}.get(method, method), "cpu"
@@ -49,7 +49,7 @@ class FakeMatcher:
     def __call__(self, left, right):
         if left.mean() == 66:
             raise KeyboardInterrupt
-        return constant(10.0 if self.method == "zncc+sgm" else 20.0, missing=[0])(left, right)
+        return constant(10.0 if self.method.endswith("sgm") else 20.0, missing=[0])(left, right)
 
 
 @pytest.fixture
@@ -355,9 +355,9 @@ def test_frames_that_a_refiner_was_trained_on_are_told_of():
 
     frames = [Frame(name, Path("l"), Path("r")) for name in ("a", "b", "c")]
     refiner = SimpleNamespace(trained_on=frozenset({"set/a", "set/c", "other/b"}))
-    matcher = SimpleNamespace(refiner="mine", _refine=refiner)
+    matcher = SimpleNamespace(refiner="mine", refine=refiner)
     line = seen_in_training(matcher, "set", frames)
     assert line is not None and "'mine' was trained on 2 of these 3 frames" in line
     assert seen_in_training(matcher, "elsewhere", frames) is None
-    assert seen_in_training(SimpleNamespace(_refine=None), "set", frames) is None
+    assert seen_in_training(SimpleNamespace(refine=None), "set", frames) is None
     assert seen_in_training(object(), "set", frames) is None

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import typer
+from limits import HANG_S
 from typer.testing import CliRunner
 
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
@@ -282,7 +283,7 @@ def test_killed_twice_it_ends_with_the_same_table(tmp_path):
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     for enough in (7, 23):
         process = start(killed)
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + HANG_S
         while records(killed) < enough and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
         assert process.poll() is None, "it ended before it could be killed"
@@ -290,7 +291,7 @@ def test_killed_twice_it_ends_with_the_same_table(tmp_path):
         process.wait()
         assert enough <= records(killed) < 48
     for output in (killed, whole):
-        assert start(output).wait(timeout=240) == 0
+        assert start(output).wait(timeout=HANG_S) == 0
     ends = [json.loads(output.with_suffix(".json").read_text()) for output in (killed, whole)]
     assert figures(ends[0]) == figures(ends[1])
     assert ends[0]["records"]["reused"] >= 23 and ends[1]["records"] == {"reused": 0, "computed": 48}

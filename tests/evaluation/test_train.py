@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from limits import HANG_S
 from typer.testing import CliRunner
 
 import stereokit
@@ -424,7 +425,7 @@ def test_a_run_that_was_killed_twice_ends_with_the_weights_of_one_that_was_not(r
         path = os.pathsep.join([*sorted(packages), *filter(None, [os.environ.get("PYTHONPATH")])])
         done = subprocess.run(
             [sys.executable, str(script), *arguments], env={**os.environ, "PYTHONPATH": path, "KILL": kill},
-            capture_output=True, text=True, timeout=120, check=False,
+            capture_output=True, text=True, timeout=HANG_S, check=False,
         )  # fmt: skip
         return done.returncode, done.stderr
 

@@ -24,18 +24,20 @@ class EmulatedQueue:
     ----------
     launches : list of (name, blocks, Report)
         What ran.
+    arrays : dict of Buffer
+        What is resident.
     """
 
     def __init__(self, seed: int | None = None) -> None:
         self.seed = seed
         self.launches: list[tuple[str, int, Report]] = []
-        self._held: dict[str, Buffer] = {}
+        self.arrays: dict[str, Buffer] = {}
         self._keys: dict[str, Any] = {}
 
     def array(self, name: str, size: int, dtype: Any) -> Buffer:
         """Return the array called `name`, of garbage."""
-        self._held[name] = Buffer(size, dtype)
-        return self._held[name]
+        self.arrays[name] = Buffer(size, dtype)
+        return self.arrays[name]
 
     def upload(self, name: str, values: np.ndarray) -> Buffer:
         """Return the array called `name` with a copy of `values`."""
@@ -50,7 +52,7 @@ class EmulatedQueue:
         if self._keys.get(name, self) != key:
             self.upload(name, make())
             self._keys[name] = key
-        return self._held[name]
+        return self.arrays[name]
 
     def view(self, held: Buffer, dtype: Any) -> Buffer:
         """Return the same memory as another type."""

@@ -11,9 +11,11 @@ pytest.importorskip("numba_cuda")
 
 from ptx.emulated import EmulatedQueue
 from ptx.harness import Buffer
-from stereokit import Matcher, matching
+from stereokit import Matcher, match_large, matching
 from stereokit.cuda import pipeline as cuda_pipeline
 from stereokit.errors import DeviceError, InputError
+from stereokit.large import matching as large_matching
+from stereokit.large.plan import plan
 from stereokit.result import Disparity
 from stereokit_refiners.linear import Linear
 
@@ -182,6 +184,20 @@ def test_images_of_the_device_at_half_size(host_as_device, refiner):
         np.testing.assert_allclose(found.confidence, want.confidence, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("low", [5, -7])
+def test_nothing_lies_below_an_odd_minimum_at_half_size(host_as_device, low):
+    pytest.importorskip("torch")
+    pair = _pair(9, 27)
+    options = {"min_disparity": low, "max_disparity": low + 16, "scale": 0.5, "right": True}
+    want = Matcher("S2", device="cpu", **options)(*pair)
+    matcher = Matcher("S2", device="cuda", **options)
+    np.testing.assert_array_equal(matcher(*pair).disparity, want.disparity)
+    found = matcher.on_device(*pair, stream=0)
+    for name in ("disparity", "right"):
+        assert getattr(want, name).min() == getattr(found, name).min() == low
+        np.testing.assert_allclose(getattr(found, name), getattr(want, name), rtol=0, atol=2e-3)
+
+
 def test_refiners_of_the_host_are_not_for_the_device(queues, monkeypatch):
     pair = _pair(9, 27)
     monkeypatch.delattr(Linear, "on_device")
@@ -209,3 +225,29 @@ def test_volumes_beyond_the_index_are_refused(queues, monkeypatch):
     monkeypatch.setattr(_Queue, "launch", lambda *_: None)
     with pytest.raises(DeviceError, match=r"levels of all pixels must be fewer than 2\*\*34 on the device"):
         matcher(image, image)
+
+
+@pytest.mark.parametrize("options", [{}, {"fill": None, "median": 0}, {"fill": "background", "median": 3}])
+def test_windows_of_a_large_image_are_filled_and_filtered_as_a_whole(queues, monkeypatch, tmp_path, options):
+    def narrow(height, width, reach_y, reach_x, available, needed):
+        return plan(height, width, reach_y, reach_x, 11 * 90, lambda rows, columns: rows * columns)
+
+    monkeypatch.setattr(large_matching, "plan", narrow)
+    left, right = _pair(11, 120)
+    maps = {}
+    for device in ("cpu", "cuda"):
+        path = tmp_path / f"{device}.npy"
+        done = match_large(left, right, path, "S2", overlap=4, device=device, **LEVELS, speckle=0.01, **options)
+        assert done.windows > 1 and done.matcher.device == device
+        maps[device] = np.load(path)
+    np.testing.assert_array_equal(maps["cuda"], maps["cpu"])
+
+
+@pytest.mark.parametrize("method", ["S1", "S2", "S3", "S4"])
+def test_the_memory_of_a_match_is_known_before_it(queues, method):
+    matcher = Matcher(method, device="cuda", **LEVELS)
+    matcher(*_pair(11, 35))
+    used = sum(array.values.nbytes for array in queues[0].arrays.values())
+    extra = 2 * 11 * 35  # masks of pixels without evidence, which this pair has none of
+    assert used <= matcher.nbytes(11, 35) <= used + extra
+    assert matcher.nbytes(44, 70) > 6 * matcher.nbytes(11, 35)

@@ -60,7 +60,7 @@ def launches(request) -> tuple[Matcher, list[tuple[Any, int, Any, Report]]]:
     left = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
     queue = _Queue()
     images = queue.upload("images", np.stack([left, np.roll(left, -4, axis=1)]))
-    pipeline = CudaPipeline(matcher._cuda_settings())
+    pipeline = CudaPipeline(matcher.settings)
     pipeline.run(queue, images, left.dtype, images[: left.size], None, left.shape)
     return matcher, [(*given, ran[2]) for given, ran in zip(queue.given, queue.launches, strict=True)]
 

@@ -67,7 +67,9 @@ def test_the_bytes_of_the_page_are_those_of_the_model():
         scale = 1 if size == "full" else 0.5
         matcher, launches = report.launches_of([methods[short]], SIZES["K"], scale)[methods[short]]
         paths = getattr(matcher.aggregation, "paths", None)
-        match = report.Match(methods[short], SIZES["K"], scale, matcher._levels().count, paths, launches, [], {})
+        match = report.Match(
+            methods[short], SIZES["K"], scale, matcher.settings.matched_levels.count, paths, launches, [], {}
+        )
         assert int(count) == len(launches)
         assert float(megabytes) == pytest.approx(match.moved / 1e6, abs=0.06)
         assert (match.of_libsgm is None) == (ratio == "-")

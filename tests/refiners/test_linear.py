@@ -49,6 +49,39 @@ def test_a_pixel_is_valid_where_its_half_size_pixel_is(size):
     np.testing.assert_allclose(fine.confidence[fine.valid], expected, rtol=1e-5)
 
 
+def upscaled_by_loops(image, height, width):
+    """Return twice the bilinear upscaling in float32: down the columns first, three quarters plus a quarter."""
+    near, far = np.float32(0.75), np.float32(0.25)
+    rows, columns = image.shape
+    out = np.empty((height, width), np.float32)
+    for y in range(height):
+        other = min(max(y // 2 + (1 if y % 2 else -1), 0), rows - 1)
+        line = [np.float32(2) * (near * image[y // 2, x] + far * image[other, x]) for x in range(columns)]
+        for x in range(width):
+            beside = min(max(x // 2 + (1 if x % 2 else -1), 0), columns - 1)
+            out[y, x] = near * line[x // 2] + far * line[beside]
+    return out
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("size", [*SIZES, (23, 150)])
+def test_bits_are_those_of_loops_whatever_the_threads(size, threads):
+    coarse = coarse_of(size, 4, gaps=0.05)
+    fine = Linear()(coarse, np.zeros(size, np.uint8), threads=threads)
+    expected = upscaled_by_loops(coarse.disparity, *size)
+    np.testing.assert_array_equal(fine.disparity, expected)
+
+
+@pytest.mark.parametrize("size", [*SIZES, (23, 150)])
+def test_tensors_are_upscaled_to_the_same_bits(size):
+    torch = pytest.importorskip("torch")
+    from stereokit_refiners.runtimes.tensors import upscaled
+
+    image = coarse_of(size, 5, gaps=0.05).disparity
+    found = upscaled(torch.from_numpy(image), 2, *size).numpy()
+    np.testing.assert_array_equal(found, upscaled_by_loops(image, *size))
+
+
 def test_gaps_stay_gaps_and_reach_no_further_than_their_neighbours():
     coarse = coarse_of((20, 24), 2, gaps=0.1)
     fine = Linear()(coarse, np.zeros((20, 24), np.uint8))

@@ -107,9 +107,9 @@ def test_shipped_refiners_by_name(pair, name):
 @pytest.mark.parametrize("backend", LEARNED)
 def test_options_reach_the_refiner(pair, path, backend):
     made = matcher(refiner=path, backend=backend, precision="fp32")
-    assert (made._refine.backend, made._refine.precision) == (backend, "fp32")
+    assert (made.refine.backend, made.refine.precision) == (backend, "fp32")
     expected = LearnedRefiner(path, backend=backend, precision="fp32").fingerprint
-    assert made._refine.fingerprint == expected
+    assert made.refine.fingerprint == expected
     assert made(*pair).disparity.shape == pair[0].shape
 
 

@@ -12,6 +12,7 @@ import sys
 import numpy as np
 import oracles
 import pytest
+from limits import HANG_S
 from refining import NAMES, one_line, random_arrays
 
 torch = pytest.importorskip("torch")
@@ -524,7 +525,7 @@ def test_two_processes_train_one_network(tmp_path):
     packages = [here, here.parent, *(Path(m.__file__).parents[1] for m in (stereokit, stereokit_refiners))]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script),
                str(tmp_path), *map(str, packages)]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False)
     assert done.returncode == 0, done.stderr
     with np.load(tmp_path / "rank-0.npz") as zero, np.load(tmp_path / "rank-1.npz") as one:
         first, second = dict(zero), dict(one)

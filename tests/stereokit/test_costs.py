@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cv2
+import numba
 import numpy as np
 import oracles
 import pytest
@@ -215,6 +217,71 @@ def test_a_row_cost_sees_bad_pixels_as_no_evidence(random_pair, added_cost):
     volume = cost_volume(left, right, "difference", outside=1.0, **options(0, 4))
     assert (volume[1, 6] == 60).all()
     assert all(volume[3, 2 + d, d] == 60 for d in range(4))
+
+
+@pytest.fixture(scope="module")
+def street():
+    """Return a pair as a camera gives it, (H, W) uint8 each, and its disparity: noise, gain, two slanted surfaces."""
+    rng = np.random.default_rng(20)
+    height, width = 80, 240
+    texture = np.kron(rng.normal(size=(height // 4, width // 4)), np.ones((4, 4))) * 40
+    texture = cv2.GaussianBlur(texture + rng.normal(size=(height, width)) * 30, (0, 0), 0.8) + 120
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    disparity = np.where(y < 40, 6 + x / 60, 10 + y / 12).astype(np.float32)
+    left = cv2.remap(texture.astype(np.float32), x - disparity, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    noisy = [image + rng.normal(size=image.shape) * 2 for image in (left, 0.97 * texture + 2)]
+    return [np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in noisy], disparity
+
+
+@numba.njit(nogil=True)
+def compiled_difference(left, right, y, min_disparity, out):
+    for x in range(out.shape[0]):
+        for d in range(out.shape[1]):
+            xr = x - d - min_disparity
+            if 0 <= xr < right.shape[1]:
+                out[x, d] = min(abs(np.int32(left[y, x]) - np.int32(right[y, xr])), 60)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_a_row_cost_works_with_the_defaults_on_what_cameras_give(street, dtype, monkeypatch):
+    monkeypatch.setattr(stereokit.COSTS, "_items", dict(stereokit.COSTS._items))
+    stereokit.COSTS.register("difference")(RowCost(compiled_difference, 60, "difference"))
+    pair, truth = street
+    if dtype != np.uint8:
+        pair = [image.astype(dtype) * dtype(13) + dtype(0.5 if dtype == np.float32 else 700) for image in pair]
+    for scale in (1, 0.5):
+        result = stereokit.Matcher("difference+sgm", max_disparity=32, scale=scale)(*pair)
+        seen = np.s_[:, 20:]
+        error = np.abs(result.disparity - truth)[seen]
+        assert np.mean(error > 3) < 0.05
+        assert result.density > 0.7
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("smooth", [0, 0.6, 2.0])
+def test_a_row_cost_sees_8_bits_whatever_comes_in(random_pair, dtype, smooth):
+    seen = []
+
+    def spy(left, right, y, min_disparity, out):
+        seen.append((left, right))
+        out[:] = 0
+
+    left, right = (np.sort(image, axis=1) for image in random_pair(6, 40, seed=21))
+    given = [image.astype(dtype) for image in (left, right)]
+    if dtype == np.uint16:
+        given = [image * dtype(100) + dtype(5000) for image in given]
+    if dtype == np.float32:
+        given = [image / dtype(255) for image in given]
+    cost_volume(*given, RowCost(spy, 60), smooth=smooth, max_disparity=4)
+    low, high = (
+        (0, 255) if dtype == np.uint8 else (float(min(left.min(), right.min())), float(max(left.max(), right.max())))
+    )
+    for image, source in zip(seen[0], (left, right), strict=True):
+        assert image.dtype == np.uint8
+        expected = (source - low) / (high - low) * 255
+        if smooth:
+            expected = oracles.gaussian(expected, smooth)
+        np.testing.assert_allclose(image, expected, atol=1.2)
 
 
 @pytest.mark.parametrize(

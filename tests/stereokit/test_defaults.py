@@ -8,7 +8,8 @@ import pytest
 import stereokit
 from stereokit import Matcher
 from stereokit.defaults import DEFAULTS, HALF, METHODS, defaults_of
-from stereokit.images.gray import gray_pair, half_size
+from stereokit.images.gray import gray_pair
+from stereokit.images.resize import half_size
 from stereokit.methods import option_names
 from stereokit.registry import AGGREGATIONS, COSTS
 

@@ -145,6 +145,6 @@ def test_a_matcher_of_the_gpu_cannot_be_unpickled_without_one(no_driver):
 
 def test_levels_of_half_size_cover_those_of_full_size():
     for low, high in ((0, 1), (-3, 2), (-1, 64), (5, 6)):
-        levels = Matcher("S2", min_disparity=low, max_disparity=high, scale=0.5)._levels()
+        levels = Matcher("S2", min_disparity=low, max_disparity=high, scale=0.5).settings.matched_levels
         assert levels.minimum * 2 <= low
         assert (levels.minimum + levels.count) * 2 >= high

@@ -8,7 +8,9 @@ import pytest
 
 import stereokit
 from stereokit import InputError, Matcher, OptionError, StereokitError, UnknownNameError, match
-from stereokit.images.gray import gray_pair, half_size, smooth
+from stereokit.images.gray import gray_pair
+from stereokit.images.intensity import to_gray
+from stereokit.images.resize import half_size, smooth
 
 METHOD = "census+sgm"
 KEEP_ALL = {"fill": None, "smp": False, "speckle": 0, "uniqueness": 0, "median": 0}
@@ -71,6 +73,16 @@ def test_rgb_is_grey_by_the_usual_weights(dtype):
     pure = np.zeros((1, 3, 3), np.uint8)
     pure[0, range(3), range(3)] = 255
     np.testing.assert_array_equal(gray_pair(pure, pure).left, [[76, 150, 29]])  # red, green, blue
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floats_become_grey_by_one_operation_after_the_other(dtype):
+    """No fused operations and no sums in another order, or the bits would depend on the processor."""
+    image = np.random.default_rng(0).normal(0, 100, (9, 67, 3)).astype(dtype)
+    weights = [dtype(weight) for weight in (0.299, 0.587, 0.114)]
+    expected = [[(r * weights[0] + g * weights[1]) + b * weights[2] for r, g, b in row] for row in image]
+    np.testing.assert_array_equal(to_gray(image), np.array(expected, dtype))
+    assert to_gray(image).dtype == dtype
 
 
 def test_grey_may_have_a_channel_axis():
@@ -236,20 +248,21 @@ A = np.zeros((4, 5), np.uint8)
     [
         (A[0], A, ["left", "(5,)"]),
         (A, A[None, None], ["right", "(1, 1, 4, 5)"]),
-        (np.zeros((4, 5, 4), np.uint8), A, ["left", "(4, 5, 4)"]),
+        (np.zeros((4, 5, 5), np.uint8), A, ["left", "(4, 5, 5)"]),
         (np.zeros((4, 5, 2), np.uint8), A, ["left", "(4, 5, 2)"]),
         (A[:0], A[:0], ["left", "empty", "(0, 5)"]),
         (A, A[:, :0], ["right", "empty", "(4, 0)"]),
         (np.zeros((0, 5, 3), np.uint8), A, ["left", "empty"]),
         (A, A[:3], ["same size", "(4, 5)", "(3, 5)"]),
         (A, A.astype(np.float32), ["same type", "uint8", "float32"]),
-        (A.astype(np.int32), A, ["left", "int32", "uint8"]),
-        (A, A.astype(np.float16), ["right", "float16"]),
-        (A.astype(bool), A, ["left", "bool"]),
+        (A.astype(np.int32), A, ["same type", "int32", "uint8"]),
+        (A, A.astype(np.float16), ["same type", "uint8", "float16"]),
         (A.astype(complex), A, ["left", "complex"]),
+        (A, A.astype("M8[s]"), ["right", "datetime64"]),
         (A.astype(object), A, ["left", "object"]),
-        ("left.png", A, ["left", "uint8"]),
-        (None, A, ["left"]),
+        ("left.png", A, ["left", "numbers", "<U8"]),
+        (None, A, ["left", "None", "was the file read?"]),
+        (A, None, ["right", "None", "was the file read?"]),
         ([[1, 2], [3]], A, ["left"]),
     ],
 )
@@ -270,7 +283,7 @@ BAD_OPTIONS = [
     ({"max_disparity": None}, ["max_disparity", "None"]),
     ({"max_disparity": 2049}, ["max_disparity", "2048", "2049"]),
     ({"min_disparity": 0.5}, ["min_disparity", "0.5"]),
-    ({"scale": 2}, ["scale", "1 or 0.5", "2"]),
+    ({"scale": 2}, ["scale", "1, 0.5 or 0.25", "2"]),
     ({"scale": None}, ["scale", "None"]),
     ({"scale": "half"}, ["scale", "half"]),
     ({"device": "tpu"}, ["device", "cpu", "tpu"]),
@@ -287,6 +300,8 @@ BAD_OPTIONS = [
     ({"median": "wide"}, ["median", "wide"]),
     ({"outside": 1.5}, ["outside", "1.5"]),
     ({"outside": float("nan")}, ["outside", "nan"]),
+    ({"nodata": "none"}, ["nodata", "number", "none"]),
+    ({"nodata": True}, ["nodata", "True"]),
     ({"smooth": -1}, ["smooth", "0 to 10", "-1"]),
     ({"smooth": None}, ["smooth", "None"]),
     ({"uniqueness": 101}, ["uniqueness", "0 to 100", "101"]),

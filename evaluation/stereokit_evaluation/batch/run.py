@@ -89,16 +89,11 @@ class Summary:
 def identity(job: Job, inputs: Any) -> dict[str, Any]:
     """Return what all maps of a job depend on: resolved options, weights, version and inputs."""
     matcher = matcher_of(job)
-    options = {name: value for name, value in sorted(vars(matcher).items()) if not name.startswith("_")}
-    options.pop("threads")
-    weights = getattr(matcher._refine, "fingerprint", None)
     return {
         "inputs": inputs,
-        "method": options.pop("method"),
+        **matcher.identity(),
         "format": job.suffix,
         "color": job.color,
-        **{name: v if isinstance(v, (int, float, str, type(None))) else repr(v) for name, v in options.items()},
-        "weights": weights if isinstance(weights, str) else None,
         "version": stereokit.__version__,
     }
 

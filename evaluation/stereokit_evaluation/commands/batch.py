@@ -35,7 +35,7 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.errors import FileError, OptionError, StereokitError
-from stereokit.images.gray import check_integer
+from stereokit.images.check import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES
 from stereokit_evaluation.batch.job import Job, matcher_of
 from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
@@ -54,7 +54,7 @@ _SHOWN_ERRORS = 10
 def batch(
     inputs: Annotated[list[Path], typer.Argument(help="A folder, a list or a video; or two folders or two videos.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the maps, NAME.FORMAT.")],
-    method: MethodOption = "zncc+sgm",
+    method: MethodOption = "census+sgm",
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,

@@ -25,6 +25,7 @@ from stereokit.cuda.driver import describe
 from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
 from stereokit.io import read_image
+from stereokit.large.memory import free_nbytes
 from stereokit.methods import parse_method
 from stereokit_evaluation.bench import gpu as gpu_times
 from stereokit_evaluation.bench.peers import PEERS, Call, label, make, opencv_threads, peers
@@ -293,17 +294,7 @@ def _time_first(
 def _too_large(key: str, size: Size) -> str | None:
     """Return why this peer is left out: the machine's free memory does not hold what it is known to need."""
     needed = PEERS[key].bytes_per_cell * size.cells if key in PEERS else 0
-    free = _free_bytes()
-    if free is None or needed <= 0.8 * free:
+    free = free_nbytes()
+    if needed <= 0.8 * free:
         return None
     return f"needs {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free"
-
-
-def _free_bytes() -> float | None:
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return 1024.0 * int(line.split()[1])
-    except OSError:
-        pass
-    return None

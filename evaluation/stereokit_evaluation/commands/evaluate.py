@@ -43,7 +43,7 @@ from stereokit_evaluation.scoring.summary import figures
 
 __all__ = ["Result", "evaluate", "run"]
 
-_DEFAULT_METHOD = "zncc+sgm"
+_DEFAULT_METHOD = "census+sgm"
 _DEFAULT_DISPARITIES = 128
 _OWN_OPTIONS = frozenset(("method", "scale", "refiner", "device", "threads", "max_disparity"))
 

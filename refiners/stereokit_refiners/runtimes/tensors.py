@@ -23,7 +23,7 @@ from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["TensorRefiner", "linear_on_device", "refine_on_device"]
+__all__ = ["TensorRefiner", "linear_on_device", "refine_on_device", "upscaled"]
 
 
 class TensorRefiner:
@@ -141,16 +141,24 @@ def refine_on_device(
 
 def linear_on_device(coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Tensor, Tensor, Tensor | None]:
     """Upscale a map that lies on the GPU; see `stereokit_refiners.linear` and `DeviceRefiner`."""
-
-    def upscaled(image: Tensor) -> Tensor:
-        full = F.interpolate(image[None, None], scale_factor=2, mode="bilinear", align_corners=False)
-        return full[0, 0, :rows, :columns]
-
     with _running_on(stream, left):
         rows, columns = _tensor(left).shape
         known = _doubled(_tensor(coarse.valid), rows, columns)
-        sure = None if coarse.confidence is None else upscaled(_tensor(coarse.confidence)) * (known != 0)
-        return upscaled(_tensor(coarse.disparity)) * 2, known, sure
+        sure = None
+        if coarse.confidence is not None:
+            sure = upscaled(_tensor(coarse.confidence), 1, rows, columns) * (known != 0)
+        return upscaled(_tensor(coarse.disparity), 2, rows, columns), known, sure
+
+
+def upscaled(image: Tensor, gain: float, rows: int, columns: int) -> Tensor:
+    """Return `stereokit_refiners.linear.upscaled` of a tensor: the same operations in the same order, the same bits."""
+    for axis, factor in ((0, gain), (1, 1)):
+        ends = image.narrow(axis, 0, 1), image.narrow(axis, image.shape[axis] - 1, 1)
+        before = torch.cat([ends[0], image.narrow(axis, 0, image.shape[axis] - 1)], axis)
+        after = torch.cat([image.narrow(axis, 1, image.shape[axis] - 1), ends[1]], axis)
+        pair = [(image * 0.75 + other * 0.25) * factor for other in (before, after)]
+        image = torch.stack(pair, axis + 1).flatten(axis, axis + 1)
+    return image[:rows, :columns].contiguous()
 
 
 def _tensor(held: Any) -> Tensor:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from stereokit.errors import OptionError
-from stereokit.images.gray import check_flag, check_integer, check_number
+from stereokit.images.check import check_flag, check_integer, check_number
 from stereokit_refiners.runtimes.encode import check_form
 
 __all__ = ["LOSSES", "PRESETS", "Settings"]

@@ -1,4 +1,4 @@
-"""Measured figures for the pages, taken from the README so that they stand in one place.
+"""Measured figures for the pages, taken from where they stand: the page of benchmarks.
 
 A table is found by a cell of its head; the paragraph under it, which says how it was measured, comes along.
 """
@@ -16,7 +16,7 @@ __all__ = ["Table", "find", "tradeoff"]
 
 
 class Table:
-    """One table of the README.
+    """One table of a page.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Table:
         return float(found[place]) if found else None
 
 
-def find(readme: Path, head: str) -> Table:
+def find(page: Path, head: str) -> Table:
     """Return the table that has the cell `head` in its first line.
 
     Raises
@@ -46,13 +46,13 @@ def find(readme: Path, head: str) -> Table:
         If there is no such table, or more than one.
     """
     found = []
-    for block in re.findall(r"(?:^\|.*\n)+", readme.read_text(encoding="utf-8") + "\n", flags=re.MULTILINE):
+    for block in re.findall(r"(?:^\|.*\n)+", page.read_text(encoding="utf-8") + "\n", flags=re.MULTILINE):
         lines = block.splitlines()
         if head in [_plain(cell) for cell in lines[0].strip().strip("|").split("|")]:
-            below = readme.read_text(encoding="utf-8").split(block)[1].strip().split("\n\n")[0]
+            below = page.read_text(encoding="utf-8").split(block)[1].strip().split("\n\n")[0]
             found.append(Table(lines, below))
     if len(found) != 1:
-        raise LookupError(f"{readme.name} must have one table with a column {head!r}, got {len(found)}")
+        raise LookupError(f"{page.name} must have one table with a column {head!r}, got {len(found)}")
     return found[0]
 
 

@@ -1,0 +1,64 @@
+"""The contract of an aggregation, for those who bring their own (entry-point group ``stereokit.aggregations``).
+
+An aggregation is a frozen dataclass whose fields are its options. It sweeps over the rows of a cost, adds up what it
+finds on the way and selects as it goes, so that no volume need be stored (`stereokit.aggregation.sgm.Sgm` and
+`stereokit.aggregation.dt.Dt` are two). It may further have
+
+- ``fitting(cost, defaults)``, a class method: changes to default options that a cost calls for;
+- ``check_cost(cost)``: raises `stereokit.OptionError` where options do not go with a cost;
+- ``cuda``: the name of the module with its CUDA twin, whose ``aggregate`` has the arguments of
+  `stereokit.aggregation.sgm_cuda.aggregate`. Without one the method runs on the CPU only.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.costs.rows import Cost, Levels
+from stereokit.kernels.workspace import Workspace
+from stereokit.selection.wta import Winners
+
+__all__ = ["Aggregation"]
+
+
+class Aggregation(Protocol):
+    """What an aggregation offers."""
+
+    name: ClassVar[str]
+
+    @property
+    def total_dtype(self) -> Any:
+        """Type of the aggregated costs of ``uint8`` rows."""
+
+    @property
+    def accepts_floats(self) -> bool:
+        """Whether `stereokit.aggregate` may hand it a ``float32`` volume, as a further argument ``volume``."""
+
+    def sweep(
+        self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
+        threads: int, out: Winners, total: NDArray[Any] | None = None,
+    ) -> None:  # fmt: skip
+        """Aggregate the rows of a cost and select.
+
+        Parameters
+        ----------
+        rows : list of row producers
+            As `stereokit.costs.rows.Cost.prepare` returns them: at least two, and one for each thread.
+        levels : Levels
+            Disparities.
+        cost : Cost
+            The cost that produces the rows; its range and unit scale penalties.
+        guide : (H, W) uint8
+            Left grey image, along whose edges costs are not mixed.
+        workspace : Workspace
+            Buffers.
+        threads : int
+            Threads to use; the result must not depend on it.
+        out : Winners
+            Where `stereokit.selection.wta.select_row` writes.
+        total : (H, W, P) of `total_dtype`, optional
+            Where the aggregated costs go, if they are wanted.
+        """

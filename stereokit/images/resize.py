@@ -1,0 +1,88 @@
+"""What happens to a grey pair before it is matched: half size, and a Gaussian."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.images.gray import GrayPair
+from stereokit.images.intensity import scale_guide
+from stereokit.kernels.threads import run
+from stereokit.kernels.workspace import Workspace
+
+__all__ = ["half_size", "reduced", "smooth"]
+
+
+def smooth(
+    pair: GrayPair, sigma: float, workspace: Workspace | None = None, threads: int = 1, *, eight_bits: bool = False
+) -> GrayPair:
+    """Return the pair with both images smoothed by a Gaussian; the guide stays as sharp as it was.
+
+    The result is 16 bit, so that nothing is lost to rounding: 8-bit images are multiplied by 256 first. For costs that
+    take 8 bits only, it is rounded to 8 bits in the end, and images of 16 bits are brought to 256 levels first.
+
+    Parameters
+    ----------
+    pair : GrayPair
+    sigma : float
+        Standard deviation in pixels; 0 returns the pair itself.
+    workspace : Workspace or None
+        Where the smoothed images are kept until the next call; None makes new ones.
+    threads : int
+        Threads to use.
+    eight_bits : bool
+        Whether the result is of 8 bits, whatever the pair is.
+    """
+    if eight_bits and pair.left.dtype != np.uint8:
+        left, right = scale_guide(pair.left, *pair.span), scale_guide(pair.right, *pair.span)
+        pair = GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide)
+    if sigma == 0:
+        return pair
+    held = workspace or Workspace()
+    images = pair.left, pair.right
+    wide, blurred = ([held.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
+
+    def blur(k: int) -> None:
+        image = images[k]
+        if image.dtype == np.uint8:
+            image = np.multiply(image, np.uint16(256), out=wide[k])
+        cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
+
+    run([partial(blur, 0), partial(blur, 1)], threads)
+    left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
+    return GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide, pair.ranges, pair.span)
+
+
+def reduced(pair: GrayPair, step: int) -> GrayPair:
+    """Return the pair at 1/`step` of its size, 1, 2 or 4: halved as often as that takes."""
+    while step > 1:
+        pair, step = half_size(pair), step // 2
+    return pair
+
+
+def half_size(pair: GrayPair) -> GrayPair:
+    """Return the pair at half size, ``(ceil(H/2), ceil(W/2))``: the mean of each 2x2 pixels.
+
+    Odd sizes are extended by their last row or column. A pixel is bad if one of its four is.
+    """
+
+    def shrink(image: NDArray[Any]) -> NDArray[Any]:
+        height, width = image.shape
+        even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        size = (even.shape[1] // 2, even.shape[0] // 2)
+        return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0])
+
+    def shrink_bad(bad: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        if bad is None:
+            return None
+        height, width = bad.shape
+        even = np.pad(bad, ((0, height % 2), (0, width % 2)))
+        return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))
+
+    left, right = shrink(pair.left), shrink(pair.right)
+    guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
+    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide, pair.ranges, pair.span)

@@ -1,0 +1,174 @@
+"""What every way from a pair to a map offers, and the one through the CPU.
+
+A pipeline is made of `stereokit.settings.MatchSettings` and keeps nothing but buffers between calls; it may be used by
+many threads at the same time. The way through the GPU is `stereokit.cuda.pipeline.CudaPipeline`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereokit.costs.rows import Pair, takes_8_bits
+from stereokit.errors import OptionError
+from stereokit.images.gray import GrayPair
+from stereokit.images.intensity import scale_guide
+from stereokit.images.resize import reduced, smooth
+from stereokit.kernels.threads import team
+from stereokit.kernels.trace import span
+from stereokit.kernels.workspace import Pool, Workspace
+from stereokit.postprocess.chain import post_process
+from stereokit.result import Disparity
+from stereokit.selection.wta import winners_like
+from stereokit.settings import Detail, MatchSettings
+
+__all__ = ["CpuPipeline", "Pipeline", "refined"]
+
+_PROBES = (256, 512)
+"""Sides of the windows that are matched to see how buffers grow, pixels."""
+
+
+class Pipeline(Protocol):
+    """From a checked pair to the left view's map."""
+
+    @property
+    def settings(self) -> MatchSettings:
+        """All that a map depends on beside the images."""
+
+    def match(self, pair: GrayPair, threads: int) -> Disparity:
+        """Match a checked pair.
+
+        Parameters
+        ----------
+        pair : GrayPair
+            At full size, also where it is matched at half size.
+        threads : int
+            Threads that this call may use; the result does not depend on it.
+
+        Returns
+        -------
+        Disparity, (H, W)
+            Refined, where a refiner was asked for; without the right view's map.
+        """
+
+    def replaced(self, **changes: Any) -> Pipeline:
+        """Return a pipeline of the same kind whose settings differ in some values."""
+
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+        """Return how many bytes of buffers the matching of a pair takes, beside images, maps and the refiner.
+
+        Parameters
+        ----------
+        height, width : int
+            Of the images, pixels.
+        dtype : dtype
+            Of the grey images, uint8 or uint16.
+        """
+
+
+def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads: int) -> Disparity:
+    """Return the map that a pipeline hands out: at full size, without what only the refiner wanted.
+
+    Raises
+    ------
+    OptionError
+        If the refiner returns something else than a map of the image's size.
+    """
+    if settings.refiner is None:
+        return coarse
+    further: dict[str, Any] = {}
+    if getattr(settings.refiner, "any_scale", False):
+        further["scale"] = settings.scale
+    if getattr(settings.refiner, "needs_right", False):
+        further["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
+    with span("refine", "refine"):
+        full = settings.refiner(coarse, pair.guide, threads=threads, **further)
+    if not isinstance(full, Disparity) or full.disparity.shape != pair.guide.shape:
+        got = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
+        size = pair.guide.shape
+        raise OptionError(f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {got}")
+    disparity = full.disparity
+    if getattr(settings.refiner, "needs_right", False):  # it measures for itself, and may leave the range
+        levels = settings.levels
+        disparity = np.clip(disparity, np.float32(levels.minimum), np.float32(levels.minimum + levels.count - 1))
+    elif settings.floor is not None:
+        disparity = np.maximum(disparity, np.float32(settings.floor))
+    return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
+
+
+class CpuPipeline:
+    """The way through the CPU.
+
+    Parameters
+    ----------
+    settings : MatchSettings
+    """
+
+    def __init__(self, settings: MatchSettings) -> None:
+        self.settings = settings
+        self._workspaces = Pool(Workspace)
+        self._growth: dict[np.dtype[Any], NDArray[np.float64]] = {}  # of the buffers, by type of image
+
+    def match(self, pair: GrayPair, threads: int) -> Disparity:
+        """Match a checked pair; see `Pipeline`."""
+        with self._workspaces.take() as workspace, team(threads):
+            coarse = self._coarse(pair, workspace, threads)
+        return refined(self.settings, coarse, pair, threads)
+
+    def _coarse(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
+        """Return the map of the size at which is matched."""
+        settings = self.settings
+        cost, aggregation, levels = settings.cost, settings.aggregation, settings.matched_levels
+        if settings.scale != 1:
+            with span("prepare", "half size"):
+                pair = reduced(pair, settings.step)
+        with span("prepare", "smooth"):
+            pair = smooth(pair, settings.smooth, workspace, threads, eight_bits=takes_8_bits(cost))
+        shape = pair.left.shape
+        with span("prepare", "prepare cost"):
+            rows = cost.prepare(
+                Pair(
+                    pair.left, pair.right, pair.left_bad, pair.right_bad, levels, settings.outside, threads, pair.ranges
+                ),
+                workspace,
+                max(2, threads),
+            )
+        disparity = workspace.array("match.disparity", shape, np.float32)
+        total = workspace.array("match.cost", shape, aggregation.total_dtype)
+        confidence = np.empty(shape, np.float32) if settings.detail >= Detail.CONFIDENCE else None
+        candidates = np.empty((2, *shape), np.float32) if settings.detail >= Detail.CANDIDATES else None
+        out = winners_like(
+            disparity, total, confidence, levels.count, levels.minimum, settings.subpixel, settings.uniqueness,
+            candidates,
+        )  # fmt: skip
+        with span("match", "sweep, around its kernels"):
+            aggregation.sweep(rows, levels, cost, pair.guide, workspace, threads, out)
+        with span("clean", "post-processing"):
+            chain = settings.post_processing(disparity.size)
+            disparity, valid = post_process(disparity, total, pair.left_bad, chain, workspace, threads)
+            if confidence is not None:
+                confidence[~valid] = 0
+        return Disparity(disparity, valid, confidence, candidates=candidates)
+
+    def replaced(self, **changes: Any) -> CpuPipeline:
+        """Return a pipeline whose settings differ in some values."""
+        return CpuPipeline(self.settings.replaced(**changes))
+
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+        """Return how many bytes of buffers a pair takes; see `Pipeline`. Found by matching four small pairs."""
+        dtype = np.dtype(dtype)
+        if dtype not in self._growth:
+            sizes = [(rows, columns) for rows in _PROBES for columns in _PROBES]
+            terms = np.array([(1, rows, columns, rows * columns) for rows, columns in sizes], float)
+            nbytes = np.array([self._buffer_nbytes(*size, dtype) for size in sizes], float)
+            self._growth[dtype] = np.linalg.solve(terms, nbytes)
+        return float(self._growth[dtype] @ (1, height, width, height * width))
+
+    def _buffer_nbytes(self, height: int, width: int, dtype: Any) -> int:
+        """Return the bytes of the buffers of one match, which is made for it."""
+        image = (np.arange(height * width, dtype=np.uint32) * 2654435761 >> 16).astype(dtype).reshape(height, width)
+        workspace = Workspace()
+        self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, 1)
+        return workspace.nbytes

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import OptionError, StereokitError
+from stereokit.errors import DeviceError, OptionError, StereokitError
 from stereokit.postprocess import fill
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
@@ -143,17 +143,35 @@ class LearnedRefiner:
         """Whether the coarse map must come with the matcher's candidates."""
         return not {"candidates", "evidence"}.isdisjoint(network_named(self._file.network).inputs)
 
-    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
+    @property
+    def needs_right(self) -> bool:
+        """Whether the right image must come too."""
+        return "evidence" in network_named(self._file.network).inputs
+
+    @property
+    def any_scale(self) -> bool:
+        """Whether maps of other sizes than half are taken."""
+        return self.needs_right
+
+    def __call__(
+        self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
+        threads: int = 1,
+    ) -> Disparity:  # fmt: skip
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
 
-        Where the coarse map is NaN, the result is; the network sees it filled. Networks know disparities from 0 on:
-        one whose map goes below sees it lifted by as much.
+        Where the coarse map is NaN, the result is; the network sees it filled. Networks of half-size maps alone know
+        disparities from 0 on: one whose map goes below sees it lifted by as much.
         """
+        step = round(1 / scale)
+        wanted = (-(-left.shape[0] // step), -(-left.shape[1] // step))
+        if coarse.disparity.shape != wanted:
+            size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
+            raise OptionError(f"coarse map must be {size} size of left {left.shape}, got {coarse.disparity.shape}")
+        if self.any_scale:
+            return self._weighed(coarse, left, right, step, threads)
         network = network_named(self._file.network)
         rows, columns = left.shape
         height, width = coarse.disparity.shape
-        if (height, width) != (-(-rows // 2), -(-columns // 2)):
-            raise OptionError(f"coarse map must be half the size of left {left.shape}, got {coarse.disparity.shape}")
         disparity = coarse.disparity
         unknown = np.isnan(disparity)
         gaps = bool(unknown.any())
@@ -179,8 +197,35 @@ class LearnedRefiner:
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
+    def _weighed(
+        self, coarse: Disparity, left: NDArray[Any], right: NDArray[Any] | None, step: int, threads: int
+    ) -> Disparity:
+        """Return the map of a network that weighs values by evidence from both images."""
+        rows, columns = left.shape
+        if right is None or right.shape != left.shape:
+            got = "none" if right is None else right.shape
+            raise OptionError(f"right must have the size of left {left.shape} for this refiner, got {got}")
+        if coarse.confidence is None or coarse.candidates is None:
+            raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+        disparity = coarse.disparity
+        unknown = np.isnan(disparity)
+        gaps = bool(unknown.any())
+        if gaps:
+            disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
+        found = hypotheses(disparity, coarse.candidates, left, right, step, threads)
+        inputs = {"evidence": network_input(found, coarse.confidence, left, columns, threads)}
+        full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
+        known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
+        if gaps:
+            missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
+            full[missing] = np.nan
+            known &= ~missing
+        return Disparity(full, known, sure)
+
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
+        if self.needs_right:
+            raise DeviceError(f"refiner {self._file.network!r} does not work on the device yet: match host images")
         found: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return found
 
@@ -190,43 +235,6 @@ class EvidenceRefiner(LearnedRefiner):
     """The one for every camera: see `stereokit_refiners.networks.evidence`."""
 
     architecture: ClassVar[str] = "evidence"
-    any_scale: ClassVar[bool] = True
-    needs_right: ClassVar[bool] = True
-    on_device: ClassVar[None] = None  # type: ignore[assignment]  # it works on the host only
-
-    def __call__(  # type: ignore[override]
-        self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any], scale: float = 0.5, threads: int = 1
-    ) -> Disparity:
-        """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
-
-        Where the coarse map is NaN, the result is; the network sees it filled.
-        """
-        rows, columns = left.shape
-        step = round(1 / scale)
-        wanted = (-(-rows // step), -(-columns // step))
-        if coarse.disparity.shape != wanted:
-            raise OptionError(
-                f"coarse map must be {wanted} for left {left.shape} and scale {scale:g}, got {coarse.disparity.shape}"
-            )
-        if right.shape != left.shape:
-            raise OptionError(f"right must have the size of left {left.shape}, got {right.shape}")
-        confidence, candidates = coarse.confidence, coarse.candidates
-        if confidence is None or candidates is None:
-            raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
-        disparity = coarse.disparity
-        unknown = np.isnan(disparity)
-        gaps = bool(unknown.any())
-        if gaps:
-            disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
-        found = hypotheses(disparity, candidates, left, right, step, threads)
-        inputs = {"evidence": network_input(found, confidence, left, columns, threads)}
-        full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
-        known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
-        if gaps:
-            missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
-            full[missing] = np.nan
-            known &= ~missing
-        return Disparity(full, known, sure)
 
 
 @dataclass(frozen=True, eq=False)

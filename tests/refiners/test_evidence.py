@@ -355,7 +355,7 @@ def test_grey_level_and_gain_change_little():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"scale": 0.25}, "coarse map must be"),
+        ({"scale": 0.25}, "coarse map must be a quarter of the size of left"),
         ({"right": np.zeros((5, 5), np.uint8)}, "right must have the size of left"),
     ],
 )

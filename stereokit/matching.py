@@ -47,11 +47,12 @@ class Matcher:
     max_disparity, min_disparity : int
         Disparities ``min_disparity <= d < max_disparity`` are tried, in full-size pixels. The minimum may be
         negative. 1 to 2048 levels.
-    scale : {1.0, 0.5}
-        0.5 matches at half size and lets `refiner` bring the map to full size.
+    scale : {1.0, 0.5, 0.25}
+        0.5 and 0.25 match at half and at a quarter of the size, and let `refiner` bring the map to full size.
     refiner : str, callable or None
-        For ``scale=0.5``: the name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
-        `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
+        The name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
+        `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones need
+        ``stereokit[fast]``; those other than ``"general"`` need ``scale=0.5``.
     device : {"auto", "cpu", "cuda"}
         Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``. "auto" is the CPU
         for now, with a GPU too: the kernels are tested in an interpreter and have not run on a GPU yet. Refiners run
@@ -131,7 +132,7 @@ class Matcher:
 
     @property
     def scale(self) -> float:
-        """1, or 0.5 where is matched at half size."""
+        """1, or 0.5 or 0.25 where is matched at a smaller size."""
         return self.settings.scale
 
     @property
@@ -215,6 +216,8 @@ class Matcher:
         """
         if isinstance(self._pipeline, CpuPipeline):
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
+        if self.scale == 1 and self.refiner is not None:
+            raise DeviceError(f"refiner must be None for images on the device with scale=1, got {self.refiner!r}")
         if self.settings.nodata is not None:
             raise DeviceError(f"nodata must be None for images on the device, got {self.settings.nodata:g}")
         pipeline: Any = self._pipeline
@@ -344,6 +347,8 @@ def _pipeline(settings: MatchSettings, device: str) -> Pipeline:
         return CpuPipeline(settings)
     from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
 
+    if settings.scale == 0.25:
+        raise DeviceError("scale must be 1 or 0.5 with device 'cuda', got 0.25")
     return CudaPipeline(settings)
 
 

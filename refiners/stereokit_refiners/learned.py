@@ -22,20 +22,30 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import OptionError, StereokitError, StereokitWarning
+from stereokit.errors import DeviceError, OptionError, StereokitError, StereokitWarning
 from stereokit.postprocess import fill
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
-from stereokit_refiners.linear import doubled
+from stereokit_refiners.linear import doubled, enlarged
 from stereokit_refiners.runtimes.compose import compose
 from stereokit_refiners.runtimes.encode import base_of, encode
-from stereokit_refiners.runtimes.reference import SCENE_SIZE, TOLERANCES_PX, mistake
+from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.mixture import mixture
+from stereokit_refiners.runtimes.reference import TOLERANCES_PX, input_size, mistake
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
 
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner"]
+__all__ = [
+    "BACKENDS",
+    "PRECISIONS",
+    "CnnRefiner",
+    "EvidenceRefiner",
+    "LearnedRefiner",
+    "PyramidRefiner",
+    "StereoVaeRefiner",
+]
 
 BACKENDS = ("openvino", "onnxruntime", "torch")
 PRECISIONS = ("fp32", "bf16", "int8")
@@ -136,17 +146,31 @@ class LearnedRefiner:
     @property
     def needs_confidence(self) -> bool:
         """Whether the coarse map must come with the matcher's confidence."""
-        return "confidence" in network_named(self._file.network).inputs
+        return not {"confidence", "evidence"}.isdisjoint(network_named(self._file.network).inputs)
 
     @property
     def needs_candidates(self) -> bool:
         """Whether the coarse map must come with the matcher's candidates."""
-        return "candidates" in network_named(self._file.network).inputs
+        return not {"candidates", "evidence"}.isdisjoint(network_named(self._file.network).inputs)
 
-    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
+    @property
+    def needs_right(self) -> bool:
+        """Whether the right image must come too."""
+        return "evidence" in network_named(self._file.network).inputs
+
+    @property
+    def any_scale(self) -> bool:
+        """Whether maps of other sizes than half are taken."""
+        return self.needs_right
+
+    def __call__(
+        self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
+        threads: int = 1,
+    ) -> Disparity:  # fmt: skip
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
 
-        Where the coarse map is NaN, the result is; the network sees it filled. Networks know disparities from 0 on:
+        Where the coarse map is NaN, the result is; the network sees it filled. Networks of half-size maps alone know
+        disparities from 0 on:
         one whose map goes below sees it lifted by as much, one whose map begins far above sees it lowered (see
         `stereokit_refiners.runtimes.encode.base_of`). No disparity lies beyond the smallest and the largest that the
         matcher has found.
@@ -156,11 +180,16 @@ class LearnedRefiner:
         StereokitWarning
             Once, if disparities beyond those of the training remain.
         """
+        step = round(1 / scale)
+        wanted = (-(-left.shape[0] // step), -(-left.shape[1] // step))
+        if coarse.disparity.shape != wanted:
+            size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
+            raise OptionError(f"coarse map must be {size} size of left {left.shape}, got {coarse.disparity.shape}")
+        if self.any_scale:
+            return self._weighed(coarse, left, right, step, threads)
         network = network_named(self._file.network)
         rows, columns = left.shape
         height, width = coarse.disparity.shape
-        if (height, width) != (-(-rows // 2), -(-columns // 2)):
-            raise OptionError(f"coarse map must be half the size of left {left.shape}, got {coarse.disparity.shape}")
         disparity = coarse.disparity
         unknown = np.isnan(disparity)
         gaps = bool(unknown.any())
@@ -204,10 +233,44 @@ class LearnedRefiner:
                 stacklevel=3,
             )
 
+    def _weighed(
+        self, coarse: Disparity, left: NDArray[Any], right: NDArray[Any] | None, step: int, threads: int
+    ) -> Disparity:
+        """Return the map of a network that weighs values by evidence from both images."""
+        rows, columns = left.shape
+        if right is None or right.shape != left.shape:
+            got = "none" if right is None else right.shape
+            raise OptionError(f"right must have the size of left {left.shape} for this refiner, got {got}")
+        if coarse.confidence is None or coarse.candidates is None:
+            raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+        disparity = coarse.disparity
+        unknown = np.isnan(disparity)
+        gaps = bool(unknown.any())
+        if gaps:
+            disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
+        found = hypotheses(disparity, coarse.candidates, left, right, step, threads)
+        inputs = {"evidence": network_input(found, coarse.confidence, left, columns, threads)}
+        full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
+        known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
+        if gaps:
+            missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
+            full[missing] = np.nan
+            known &= ~missing
+        return Disparity(full, known, sure)
+
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
+        if self.needs_right:
+            raise DeviceError(f"refiner {self._file.network!r} does not work on the device yet: match host images")
         found: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceRefiner(LearnedRefiner):
+    """The one for every camera: see `stereokit_refiners.networks.evidence`."""
+
+    architecture: ClassVar[str] = "evidence"
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +368,7 @@ def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, 
             wrong = []
             ways = [(backend, precision), *((b, "fp32") for b in _installed() if (b, "fp32") != (backend, precision))]
             for way in ways:
-                off = mistake(content, _compile(content, *way, *SCENE_SIZE, 1))
+                off = mistake(content, _compile(content, *way, *input_size(content), 1))
                 if off <= TOLERANCES_PX[way[1]]:
                     break
                 wrong.append(f"{way[0]} in {way[1]} is off by {off:.3g} px on average")

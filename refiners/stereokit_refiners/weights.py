@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError, did_you_mean
 from stereokit.io import parsing, write_bytes
+from stereokit_refiners.networks.evidence import Evidence
 from stereokit_refiners.networks.layers import Network, activations, shapes
 from stereokit_refiners.networks.pyramid import Pyramid
 from stereokit_refiners.networks.stereovae import NonVae, StereoVae
 
 __all__ = ["NETWORKS", "WeightFile", "network_named", "read", "shipped", "write"]
 
-NETWORKS: dict[str, Network] = {network.name: network for network in (StereoVae(), NonVae(), Pyramid())}
+NETWORKS: dict[str, Network] = {network.name: network for network in (StereoVae(), NonVae(), Pyramid(), Evidence())}
 """Architectures by name."""
 
 _FORMAT = "stereokit-refiner/2"

@@ -56,7 +56,7 @@ class Bands:
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
         self._matcher = _for_windows(matcher, (self._height, self._width), windows.window)
-        self._halo = matcher.settings.median // 2 if matcher.scale == 1 else 0
+        self._halo = matcher.settings.median // 2 if matcher.refiner is None else 0
         self._last: NDArray[np.float32] | None = None  # row that a band without any valid pixel is filled from
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
@@ -89,7 +89,7 @@ class Bands:
 
     def _finished(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
         settings = self._wanted.settings
-        if settings.scale != 1:
+        if settings.refiner is not None:
             return band
         filled = settings.fill is not None
         if filled:
@@ -105,10 +105,10 @@ class Bands:
 
 def _for_windows(matcher: Matcher, image: tuple[int, int], window: tuple[int, int]) -> Matcher:
     """Return a matcher whose largest speckle has as many pixels as in the whole image, and that leaves filling."""
-    step = 1 if matcher.scale == 1 else 2
+    step = matcher.settings.step
     whole, part = (-(-height // step) * -(-width // step) for height, width in (image, window))
     speckle = matcher.settings.speckle
     changes: dict[str, Any] = {"speckle": min(1.0, (int(speckle * whole) + 0.5) / part)} if speckle else {}
-    if matcher.scale == 1:
+    if matcher.refiner is None:
         changes.update(fill=None, median=0)
     return matcher.replaced(**changes)

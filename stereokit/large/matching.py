@@ -158,7 +158,7 @@ def match_large(
     windows = _plan(matcher, sources, tone, overlap, limit, target)
     ranges: Ranges | None = None
     if getattr(matcher.cost, "needs_ranges", False):
-        ranges = find_ranges(*sources, tone, matcher.scale != 1, matcher.settings.smooth, matcher.threads)
+        ranges = find_ranges(*sources, tone, matcher.settings.step, matcher.settings.smooth, matcher.threads)
     bands = Bands(matcher, sources, tone, ranges, windows, progress)
     write_bands(target, height, width, bands)
     total = len(windows.rows) * len(windows.columns)

@@ -67,7 +67,7 @@ def test_shipped_networks_pass_with_room(name, precision):
     except FileError as error:
         pytest.skip(str(error))
     for backend in LEARNED if precision == "fp32" else {"openvino"} & set(LEARNED):
-        run = learned._compile(content, backend, precision, *reference.SCENE_SIZE, 1)
+        run = learned._compile(content, backend, precision, *reference.input_size(content), 1)
         assert reference.mistake(content, run) < reference.TOLERANCES_PX[precision] / 2
 
 

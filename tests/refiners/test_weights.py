@@ -213,7 +213,7 @@ def test_without_safetensors_the_extra_is_named(monkeypatch, tmp_path):
 
 
 def test_architectures_by_name():
-    assert list(NETWORKS) == ["stereovae", "cnn", "stereokit"]
+    assert list(NETWORKS) == ["stereovae", "cnn", "stereokit", "evidence"]
     assert network_named("cnn") is NETWORKS["cnn"]
     with pytest.raises(FileError, match=r"^no network named 'stereovea'; did you mean 'stereovae'\?"):
         network_named("stereovea")

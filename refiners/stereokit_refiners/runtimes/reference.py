@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from stereokit_refiners.networks.layers import Network, Weights, sub_pixel_kernel
 from stereokit_refiners.runtimes.compose import compose
 from stereokit_refiners.runtimes.encode import encode
+from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.mixture import mixture
 from stereokit_refiners.weights import WeightFile, network_named
 
-__all__ = ["SCENE_SIZE", "TOLERANCES_PX", "forward", "mistake"]
+__all__ = ["SCENE_SIZE", "TOLERANCES_PX", "forward", "input_size", "mistake"]
 
 Array = NDArray[np.float32]
 
@@ -87,6 +89,9 @@ class _PlainOps:
             x = np.stack(halves, axis + 1).reshape(shape)
         return x
 
+    def repeat(self, x: Array) -> Array:
+        return np.repeat(np.repeat(x, 2, axis=1), 2, axis=2)
+
 
 def _shuffled(x: Array) -> Array:
     """Return four phases, (4 C, h, w), as one map at twice the size."""
@@ -116,6 +121,37 @@ def _scene() -> dict[str, Any]:
     return {"disparity": disparity, "left": left, "confidence": confidence, "candidates": np.stack([disparity, other])}
 
 
+def input_size(content: WeightFile) -> tuple[int, int]:
+    """Return the rows and columns of a network's inputs for the scene."""
+    rows, columns = SCENE_SIZE
+    return (rows // 2, columns // 2) if _weighs(content) else SCENE_SIZE
+
+
+def _weighs(content: WeightFile) -> bool:
+    """Return whether a network's input is evidence from both images, at a quarter of their size."""
+    return "evidence" in network_named(content.network).inputs
+
+
+def _prepared(content: WeightFile) -> tuple[dict[str, Array], Callable[[Array], Array]]:
+    """Return a network's inputs for the scene, and what makes a map of its head."""
+    network, scene = network_named(content.network), _scene()
+    rows, columns = (2 * length for length in SCENE_SIZE)
+    if not _weighs(content):
+        inputs = encode(tuple(network.inputs), content.form, **scene)
+
+        def composed(head: Array) -> Array:
+            return compose(
+                content.network, content.form, head, scene["disparity"], rows, columns, candidates=scene["candidates"]
+            )
+
+        return inputs, composed
+    left = scene["left"]
+    right = np.roll(left, -24, axis=1)
+    found = hypotheses(scene["disparity"], scene["candidates"], left, right, 2)
+    inputs = {"evidence": network_input(found, scene["confidence"], left, columns)}
+    return inputs, lambda head: mixture(head, found, rows, columns)[0]
+
+
 def mistake(content: WeightFile, run: Callable[[dict[str, Array]], Array]) -> float:
     """Return how far a runtime's map of a small scene is off on average, full-size pixels; infinite if not a number.
 
@@ -123,17 +159,9 @@ def mistake(content: WeightFile, run: Callable[[dict[str, Array]], Array]) -> fl
     ----------
     content : WeightFile
     run : callable
-        The network, compiled for inputs of `SCENE_SIZE`: from the encoded inputs to the (h, w, C) head.
+        The network, compiled for inputs of `input_size`: from the encoded inputs to the (h, w, C) head.
     """
-    network, scene = network_named(content.network), _scene()
-    inputs = encode(tuple(network.inputs), content.form, **scene)
-    rows, columns = SCENE_SIZE
-    maps = [
-        compose(
-            content.network, content.form, head, scene["disparity"], 2 * rows, 2 * columns,
-            candidates=scene["candidates"],
-        )
-        for head in (run(inputs), forward(network, content.arrays, inputs))
-    ]  # fmt: skip
-    off = float(np.abs(maps[0] - maps[1]).mean())
+    inputs, finish = _prepared(content)
+    right = forward(network_named(content.network), content.arrays, inputs)
+    off = float(np.abs(finish(run(inputs)) - finish(right)).mean())
     return off if np.isfinite(off) else float("inf")

@@ -293,7 +293,7 @@ def test_other_files_are_read_whole(tmp_path):
         ({"output": "no/out.npy"}, FileError, "does not exist"),
         ({"right": np.zeros((20, 31), np.uint8)}, InputError, "same size"),
         ({"right": np.zeros((20, 30), np.uint16)}, InputError, "same type"),
-        ({"left": np.zeros((20, 30), np.int32)}, InputError, "left must be uint8"),
+        ({"left": np.zeros((20, 30), complex)}, InputError, "left must be of whole or floating-point"),
         ({"left": "none.npy"}, FileError, "no such file"),
         ({"left": "broken.npy"}, FileError, "not a readable npy file"),
         ({"left": "short.npy"}, FileError, "not a readable npy file"),

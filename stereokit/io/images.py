@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import FileError, InputError
+from stereokit.images.check import accepted_type
 from stereokit.images.intensity import to_gray
 from stereokit.io.atomic import check_output, write_bytes
 from stereokit.io.orientation import UPRIGHT, find_orientation, oriented, without_orientation
@@ -110,8 +111,10 @@ def read_oriented(path: str | os.PathLike[str], gray: bool = False) -> tuple[NDA
         If the file is missing or is not an image.
     """
     image, tag = decode(path)
-    if str(image.dtype) not in ("uint8", *_DEEP):
-        raise FileError(f"{str(path)!r} holds {image.dtype} pixels, expected uint8, uint16 or float")
+    kind = accepted_type(image.dtype)
+    if kind is None:
+        raise FileError(f"{str(path)!r} holds {image.dtype} pixels, expected whole or floating-point numbers")
+    image = image.astype(kind, copy=False)
     if image.ndim == 2 or image.shape[2] == 1:
         return np.ascontiguousarray(image.reshape(image.shape[:2])), tag
     if image.shape[2] not in (3, 4):

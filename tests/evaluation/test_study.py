@@ -272,7 +272,7 @@ def test_killed_twice_it_ends_with_the_same_table(tmp_path):
         import stereokit_refiners
 
         homes = [str(Path(module.__file__).parents[1]) for module in (stereokit, stereokit_refiners, study_run)]
-        program = [sys.executable, "-m", "stereokit.cli.app", "study", *words, "-o", str(output)]
+        program = [sys.executable, "-m", "stereokit.cli", "study", *words, "-o", str(output)]
         program += ["--json", str(output.with_suffix(".json"))]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(homes)}
         return subprocess.Popen(program, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

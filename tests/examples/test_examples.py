@@ -122,7 +122,7 @@ def test_an_installed_refiner_is_found_by_name(plugin, run_python, pair, tmp_pat
     monkeypatch.chdir(tmp_path)
     left, right, _ = pair()
     here = {"PYTHONPATH": os.pathsep.join(filter(None, [str(plugin), os.environ.get("PYTHONPATH")]))}
-    cli = ("-W", "error", "-m", "stereokit.cli.app")
+    cli = ("-W", "error", "-m", "stereokit.cli")
     assert "guided" in run_python(*cli, "list", **here)
     common = (*cli, "match", left, right, "--scale", "0.5", "--refiner", "guided", "--set", "pull=4")
     run_python(*common, "-o", "disparity.npy", "--max-disparity", "16", "--fill", "none", **here)

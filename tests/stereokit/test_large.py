@@ -403,7 +403,7 @@ def test_the_command_matches_in_windows(tmp_path, monkeypatch, run_python):
     np.save("r.npy", right)
     words = ["match", "l.npy", "r.npy", "-o", "out.npy", "--method", "S2", "--max-disparity", "16"]
     # In a process of its own: the bound is that of all that a process occupies, and this one may hold more by now.
-    run_python("-m", "stereokit.cli.app", *words, "--memory", "2GB", "--json", "out.json")
+    run_python("-m", "stereokit.cli", *words, "--memory", "2GB", "--json", "out.json")
     np.testing.assert_array_equal(np.load("out.npy"), stereokit.match(left, right, "S2", max_disparity=16))
     report = json.loads((tmp_path / "out.json").read_text())
     assert report["windows"] == 1 and report["window"] == {"height": 60, "width": 100} and report["memory"] == "2GB"

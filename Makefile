@@ -31,7 +31,7 @@ demo: $(VENV)/.user  ## match a synthetic street with S1 to S4: pictures in demo
 	$(BIN)/stereokit demo --output demo
 
 test: $(VENV)/.dev  ## all tests, two files at a time
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 fuzz: $(VENV)/.dev  ## generated calls and mutated files, ten minutes; FUZZ="--seed 2 --minutes 1" for others
 	cd tests && ../$(BIN)/python -m fuzz $(FUZZ)

@@ -6,10 +6,19 @@
 
 from stereokit.calibration import Calibration
 from stereokit.costs import Census, RowCost, Zncc
-from stereokit.errors import DeviceError, FileError, InputError, OptionError, StereokitError, UnknownNameError
+from stereokit.errors import (
+    DeviceError,
+    FileError,
+    InputError,
+    OptionError,
+    StereokitError,
+    StereokitWarning,
+    UnknownNameError,
+)
 from stereokit.io import read_disparity, read_image, write_disparity
 from stereokit.large import LargeResult, match_large
 from stereokit.matching import METHODS, Matcher, match, warmup
+from stereokit.notices import PairWarning
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
 from stereokit.selection import select
@@ -29,8 +38,10 @@ __all__ = [
     "LargeResult",
     "Matcher",
     "OptionError",
+    "PairWarning",
     "RowCost",
     "StereokitError",
+    "StereokitWarning",
     "UnknownNameError",
     "Zncc",
     "__version__",

@@ -18,15 +18,35 @@ import math
 import os
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import FileError, InputError, OptionError
+from stereokit.io import parsing, read_text
+from stereokit.notices import warn
 
 __all__ = ["Calibration", "read_calibration"]
+
+_CENTRE_PX, _SHARE = 0.5, 0.001
+"""How far what rectified cameras share may differ: principal points in pixels, focal lengths as a share of them."""
+_BASELINES_M = 0.001, 100.0
+"""Baselines outside of these are warned of: they are mostly in another unit."""
+_KINDS = "known are Middlebury's calib.txt, KITTI's files, and JSON with fx, fy, cx0, cy, baseline_m"
+_OTHER_KINDS = {
+    "an OpenCV calibration (YAML)": r"\A%YAML|!!opencv-matrix",
+    "an OpenCV calibration (XML)": r"<opencv_storage>",
+    "an OpenCV calibration (JSON)": r'"opencv-matrix"',
+    "a ROS camera_info file": r"^\s*(projection_matrix|distortion_model|camera_name)\s*:",
+    "a Kalibr camchain": r"^\s*(T_cn_cnm1|distortion_coeffs|rostopic)\s*:",
+    "a BoofCV calibration": r"^\s*leftToRight\s*:|boofcv",
+    "a ZED settings file": r"^\s*\[(LEFT|RIGHT|STEREO)(_CAM_\w+)?\]",
+    "a calibration in XML": r"\A<",
+    "a calibration of Cityscapes (JSON)": r'"(intrinsic|extrinsic)"\s*:',
+    "a file of bare numbers, such as K.txt": r"\A[-+.\deE\s,;\[\]()]+\Z",
+}
+"""What files of other programs are called, and what tells them."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +87,9 @@ class Calibration:
         for field in dataclasses.fields(self):
             name, value = field.name, getattr(self, field.name)
             if name in ("width", "height"):
-                if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-                    raise OptionError(f"{name} must be a positive whole number of pixels, got {value}")
-            elif not math.isfinite(value):
+                if value is not None:
+                    object.__setattr__(self, name, _pixels(name, value))
+            elif not _is_finite(value):
                 raise OptionError(f"{name} must be finite, got {value}")
             elif name in ("fx", "fy", "baseline_m") and value <= 0:
                 raise OptionError(f"{name} must be positive, got {value}")
@@ -192,7 +212,23 @@ class Calibration:
             )
 
 
-def read_calibration(path: str | os.PathLike[str], cameras: tuple[int, int] = (2, 3)) -> Calibration:
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond floating point
+        return False
+
+
+def _pixels(name: str, value: float) -> int:
+    """Return a size as a whole number; files and arrays may have it as 640.0."""
+    if isinstance(value, bool) or not _is_finite(value) or value != int(value) or value < 1:
+        raise OptionError(f"{name} must be a positive whole number of pixels, got {value}")
+    return int(value)
+
+
+def read_calibration(
+    path: str | os.PathLike[str], cameras: tuple[int, int] = (2, 3), size: tuple[int, int] | None = None
+) -> Calibration:
     """Read a calibration file; its content tells which of the known forms it has.
 
     Parameters
@@ -202,32 +238,55 @@ def read_calibration(path: str | os.PathLike[str], cameras: tuple[int, int] = (2
         with ``fx``, ``fy``, ``cx0``, ``cy``, ``baseline_m`` and optionally ``cx1``, ``width``, ``height``.
     cameras : pair of int
         Left and right camera of a KITTI file: (2, 3) is the colour pair, (0, 1) the grey one.
+    size : pair of int or None
+        Width and height of the images that it should be for, pixels.
+
+    Warns
+    -----
+    StereokitWarning
+        If the baseline is under 1 mm or over 100 m, or the principal point lies outside of the image.
 
     Raises
     ------
+    InputError
+        If it is for images of another `size`.
     FileError
-        If the file is missing, has none of the known forms, or lacks a field.
+        If the file is missing, has none of the known forms, lacks a field, or contradicts itself: the two cameras of a
+        rectified pair share fx, fy and cy, have no skew, and ``doffs`` is the difference of their cx.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise FileError(f"no such file: {str(path)!r}") from error
-    except UnicodeDecodeError as error:
-        raise FileError(f"{str(path)!r} is not a text file") from error
-    except OSError as error:
-        raise FileError(f"cannot read {str(path)!r}: {error.strerror or error}") from error
-    try:
+    camera = _read(path, cameras)
+    if size is not None:
+        camera.check_size(*size)
+    if not _BASELINES_M[0] <= camera.baseline_m <= _BASELINES_M[1]:
+        warn(f"{str(path)!r} has a baseline of {camera.baseline_m:g} m: is it in the unit that it should be in?")
+    width, height = size or (camera.width, camera.height)
+    for name, center, pixels in (("cx0", camera.cx0, width), ("cy", camera.cy, height)):
+        if pixels is not None and not -0.5 <= center <= pixels - 0.5:
+            warn(f"{str(path)!r} has its principal point outside of the image: {name} is {center:g} of {pixels} pixels")
+    return camera
+
+
+def _read(path: str | os.PathLike[str], cameras: tuple[int, int]) -> Calibration:
+    text = read_text(path, "calibration")
+    with parsing(path, "calibration"):
+        if other := _other_kind(text):
+            raise FileError(f"{str(path)!r} looks like {other}, which is not read; {_KINDS}")
         if text.lstrip().startswith("{"):
             return _from_json(text)
         if re.search(r"^\s*\w+\s*=", text, re.MULTILINE):
             return _from_middlebury(dict(re.findall(r"^\s*(\w+)\s*=(.*)$", text, re.MULTILINE)))
         if re.search(r"^\s*\w+:", text, re.MULTILINE):
             return _from_kitti(dict(re.findall(r"^\s*(\w+):(.*)$", text, re.MULTILINE)), cameras)
-    except KeyError as error:
-        raise FileError(f"{str(path)!r} has no field {error.args[0]!r}") from error
-    except (ValueError, OverflowError) as error:
-        raise FileError(f"{str(path)!r}: {error}") from error
-    raise FileError(f"{str(path)!r} is no calibration known here: Middlebury calib.txt, KITTI, or JSON")
+    raise FileError(f"{str(path)!r} is no calibration known here; {_KINDS}")
+
+
+def _other_kind(text: str) -> str | None:
+    """Return what a file of another program is, with its article, None if it is nothing that is known."""
+    start = text.lstrip()
+    for what, pattern in _OTHER_KINDS.items():
+        if re.search(pattern, start, re.MULTILINE):
+            return what
+    return None
 
 
 def _from_json(text: str) -> Calibration:
@@ -235,60 +294,71 @@ def _from_json(text: str) -> Calibration:
     try:
         content: Any = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ValueError(f"not valid JSON, line {error.lineno}: {error.msg}") from error
+        raise OptionError(f"not valid JSON, line {error.lineno}: {error.msg}") from error
     for name, value in content.items():
         if name not in fields:
-            raise ValueError(f"unknown field {name!r}. Known: {', '.join(fields)}")
+            raise OptionError(f"unknown field {name!r}. Known: {', '.join(fields)}")
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{name} must be a number, got {value!r}")
-    for name, needed in fields.items():
-        if needed and name not in content:
-            raise KeyError(name)
+            raise OptionError(f"{name} must be a number, got {value!r}")
+    missing = [name for name, needed in fields.items() if needed and name not in content]
+    if missing:
+        raise OptionError(f"it has no field {missing[0]!r}, which a calibration in JSON has")
     return Calibration(**content)
 
 
-def _numbers(lines: dict[str, str], name: str, count: int) -> list[float]:
+def _numbers(lines: dict[str, str], name: str, count: int, kind: str) -> list[float]:
+    if name not in lines:
+        raise OptionError(f"it has no field {name!r}, which {kind} has; {_KINDS}")
     words = lines[name].translate(str.maketrans("[];,", "    ")).split()
     try:
         values = [float(word) for word in words]
     except ValueError as error:
-        raise ValueError(f"{name} must hold {count} numbers, got {lines[name].strip()!r}") from error
+        raise OptionError(f"{name} must hold {count} numbers, got {lines[name].strip()!r}") from error
     if len(values) != count:
-        raise ValueError(f"{name} must hold {count} numbers, got {len(values)}")
+        raise OptionError(f"{name} must hold {count} numbers, got {len(values)}")
+    if not all(map(math.isfinite, values)):
+        raise OptionError(f"{name} must hold finite numbers, got {lines[name].strip()!r}")
     return values
 
 
-def _size(lines: dict[str, str], name: str) -> int | None:
-    return int(_numbers(lines, name, 1)[0]) if name in lines else None
-
-
 def _from_middlebury(lines: dict[str, str]) -> Calibration:
-    left = _numbers(lines, "cam0", 9)
-    if "doffs" in lines or "cam1" not in lines:
-        doffs = _numbers(lines, "doffs", 1)[0]
+    kind = "a Middlebury calib.txt"
+    left = _numbers(lines, "cam0", 9, kind)
+    _check_pinhole("cam0", left[0], left[1], left[3], left[6:])
+    right = None
+    if "cam1" in lines:
+        right = _numbers(lines, "cam1", 9, kind)
+        _check_pinhole("cam1", right[0], right[1], right[3], right[6:])
+        _check_rectified("cam0", (left[0], left[4], left[5]), "cam1", (right[0], right[4], right[5]))
+    if right is None or "doffs" in lines:
+        doffs = _numbers(lines, "doffs", 1, kind)[0]
     else:
-        doffs = _numbers(lines, "cam1", 9)[2] - left[2]
+        doffs = right[2] - left[2]
+    if right is not None and abs(doffs - (right[2] - left[2])) > _CENTRE_PX:
+        raise OptionError(f"doffs is {doffs:g}, but cam0 and cam1 say {right[2] - left[2]:g} (cx1 - cx0)")
     return Calibration(
         fx=left[0],
         fy=left[4],
         cx0=left[2],
         cy=left[5],
-        baseline_m=_numbers(lines, "baseline", 1)[0] / 1000,
+        baseline_m=_numbers(lines, "baseline", 1, kind)[0] / 1000,
         cx1=left[2] + doffs,
-        width=_size(lines, "width"),
-        height=_size(lines, "height"),
+        **{name: _numbers(lines, name, 1, kind)[0] for name in ("width", "height") if name in lines},  # type: ignore[arg-type]
     )
 
 
 def _from_kitti(lines: dict[str, str], cameras: tuple[int, int]) -> Calibration:
     raw = any(name.startswith("P_rect_") for name in lines)
     names = [f"P_rect_{camera:02d}" if raw else f"P{camera}" for camera in cameras]
-    left, right = (_numbers(lines, name, 12) for name in names)
-    baseline_m = right[3] / -right[0] - left[3] / -left[0] if left[0] and right[0] else math.nan
+    left, right = (_numbers(lines, name, 12, "a KITTI calibration") for name in names)
+    for name, matrix in zip(names, (left, right), strict=True):
+        _check_pinhole(name, matrix[0], matrix[1], matrix[4], matrix[8:11])
+    _check_rectified(names[0], (left[0], left[5], left[6]), names[1], (right[0], right[5], right[6]))
+    baseline_m = right[3] / -right[0] - left[3] / -left[0]
     if not baseline_m > 0:
-        raise ValueError(f"{names[1]} must lie to the right of {names[0]}, got a baseline of {baseline_m} m")
+        raise OptionError(f"{names[1]} must lie to the right of {names[0]}, got a baseline of {baseline_m} m")
     size = f"S_rect_{cameras[0]:02d}"
-    width, height = _numbers(lines, size, 2) if raw and size in lines else (None, None)
+    width, height = _numbers(lines, size, 2, "a KITTI calibration") if raw and size in lines else (None, None)
     return Calibration(
         fx=left[0],
         fy=left[5],
@@ -296,6 +366,25 @@ def _from_kitti(lines: dict[str, str], cameras: tuple[int, int]) -> Calibration:
         cy=left[6],
         baseline_m=baseline_m,
         cx1=right[2],
-        width=None if width is None else int(width),
-        height=None if height is None else int(height),
+        width=width,  # type: ignore[arg-type]
+        height=height,  # type: ignore[arg-type]
     )
+
+
+def _check_pinhole(name: str, focal: float, skew: float, below: float, last: list[float]) -> None:
+    """Refuse a camera matrix that says more than a focal length and a principal point."""
+    if not focal > 0:
+        raise OptionError(f"{name} must begin with a positive focal length, got {focal:g}")
+    if abs(skew) > _CENTRE_PX:
+        raise OptionError(f"{name} must be of a rectified camera, without skew, got a skew of {skew:g}")
+    if abs(below) > _CENTRE_PX or max(abs(a - b) for a, b in zip(last, (0, 0, 1), strict=True)) > _SHARE:
+        raise OptionError(f"{name} must be a camera matrix, with 0 below its focal length and a last row of 0 0 1")
+
+
+def _check_rectified(
+    left: str, of_left: tuple[float, float, float], right: str, of_right: tuple[float, float, float]
+) -> None:
+    """Refuse two cameras that differ in what rectified ones share: fx, fy and cy."""
+    for name, a, b in zip(("fx", "fy", "cy"), of_left, of_right, strict=True):
+        if abs(a - b) > (_CENTRE_PX if name == "cy" else _SHARE * abs(a)):
+            raise OptionError(f"{left} and {right} must share {name}, as rectified cameras do, got {a:g} and {b:g}")

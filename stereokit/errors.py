@@ -18,6 +18,7 @@ __all__ = [
     "StereokitWarning",
     "UnknownNameError",
     "did_you_mean",
+    "one_line",
     "shown",
 ]
 
@@ -59,19 +60,34 @@ def shown(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def did_you_mean(kind: str, name: str, known: Iterable[str]) -> str:
+def did_you_mean(kind: str, name: object, known: Iterable[str]) -> str:
     """Return the line that says that no `kind` is called `name`, with the nearest known name.
 
     Parameters
     ----------
     kind : str
         What was looked for, such as ``"cost"``.
-    name : str
-        The name that was asked for.
+    name : object
+        The name that was asked for, or whatever came instead of one.
     known : iterable of str
         The names that exist.
     """
     names = sorted(known)
-    close = difflib.get_close_matches(name.lower(), names, n=1)
+    close = difflib.get_close_matches(name.lower(), names, n=1) if isinstance(name, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else "."
     return f"no {kind} named {shown(name)}{hint} Known: {', '.join(names) or 'none'}"
+
+
+def one_line(text: str) -> str:
+    """Return `text` as something that can be printed anywhere, on one line.
+
+    Runs of white space become one blank; control characters, and what stands for the bytes of a file name that is no
+    UTF-8, are written as escapes.
+
+    Parameters
+    ----------
+    text : str
+        Such as a path, or the message of a library.
+    """
+    words = " ".join(text.split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)

@@ -17,14 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.aggregation.contract import Aggregation
+from stereokit.checks import doubts, doubts_about_density
 from stereokit.costs.rows import Cost
-from stereokit.cuda.driver import has_device, require_device
+from stereokit.cuda.driver import require_device
 from stereokit.defaults import METHODS
 from stereokit.errors import DeviceError, InputError, OptionError, shown
 from stereokit.images.check import check_integer
 from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
+from stereokit.notices import PairWarning, collecting, warn
 from stereokit.pipeline import CpuPipeline, Pipeline
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
@@ -45,14 +47,16 @@ class Matcher:
     max_disparity, min_disparity : int
         Disparities ``min_disparity <= d < max_disparity`` are tried, in full-size pixels. The minimum may be
         negative. 1 to 2048 levels.
-    scale : {1.0, 0.5}
-        0.5 matches at half size and lets `refiner` bring the map to full size.
+    scale : {1.0, 0.5, 0.25}
+        0.5 and 0.25 match at half and at a quarter of the size, and let `refiner` bring the map to full size.
     refiner : str, callable or None
-        For ``scale=0.5``: the name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
-        `stereokit_refiners.Refiner`); None is ``"linear"``. Learned ones need ``stereokit[fast]``.
+        The name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
+        `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones need
+        ``stereokit[fast]``; those other than ``"general"`` need ``scale=0.5``.
     device : {"auto", "cpu", "cuda"}
-        Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``; "auto" takes it
-        where it can be used, else the CPU. Refiners run on the CPU, but for `on_device`.
+        Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``. "auto" is the CPU
+        for now, with a GPU too: the kernels are tested in an interpreter and have not run on a GPU yet. Refiners run
+        on the CPU, but for `on_device`.
     threads : int or None
         Threads of one call; None uses the processors at hand. The result does not depend on it.
     fill : {"background", "nearest"} or None
@@ -128,7 +132,7 @@ class Matcher:
 
     @property
     def scale(self) -> float:
-        """1, or 0.5 where is matched at half size."""
+        """1, or 0.5 or 0.25 where is matched at a smaller size."""
         return self.settings.scale
 
     @property
@@ -212,6 +216,8 @@ class Matcher:
         """
         if isinstance(self._pipeline, CpuPipeline):
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
+        if self.scale == 1 and self.refiner is not None:
+            raise DeviceError(f"refiner must be None for images on the device with scale=1, got {self.refiner!r}")
         if self.settings.nodata is not None:
             raise DeviceError(f"nodata must be None for images on the device, got {self.settings.nodata:g}")
         pipeline: Any = self._pipeline
@@ -233,19 +239,24 @@ class Matcher:
         Disparity
             Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, if asked for,
             ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
-            a filled map is `min_disparity` everywhere; learned refiners may add a pixel or two.
+            a filled map is `min_disparity` everywhere.
+
+        Warns
+        -----
+        PairWarning
+            If both images are the same, or hardly anything could be measured; see `stereokit.checks`.
+        StereokitWarning
+            If few grey levels hold nearly all pixels of images of more than 8 bits.
 
         Raises
         ------
         InputError
             If the images cannot be used.
-
-        Warns
-        -----
-        StereokitWarning
-            If few grey levels hold nearly all pixels of images of more than 8 bits.
         """
-        return self._call(left, right, self.threads)
+        found = self._call(left, right, self.threads)
+        for line in doubts(left, right, found, self.min_disparity, self.max_disparity):
+            warn(line, PairWarning)
+        return found
 
     def map(
         self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None
@@ -267,6 +278,11 @@ class Matcher:
         ------
         Disparity
 
+        Warns
+        -----
+        PairWarning
+            At the first pair of which hardly anything could be measured.
+
         Raises
         ------
         InputError
@@ -277,6 +293,7 @@ class Matcher:
         # On a GPU each worker has buffers of its own there.
         workers = Workers(self.threads if self.device == "cpu" else min(2, self.threads))
         try:
+            doubted = False
             failure: Exception | None = None  # of the source: what it gave before is still matched
             for done in itertools.count(1):
                 while failure is None and len(ahead) < 2 * self.threads:
@@ -297,6 +314,10 @@ class Matcher:
                     raise failure
                 result = ahead[0].result()
                 ahead.popleft()
+                for line in doubts_about_density(result.density, self.min_disparity, self.max_disparity):
+                    if not doubted:
+                        warn(f"pair {done - 1}: {line}", PairWarning)
+                    doubted = True
                 yield result
                 if progress is not None:
                     progress(done)
@@ -321,16 +342,14 @@ class Matcher:
 
 
 def _pipeline(settings: MatchSettings, device: str) -> Pipeline:
-    """Return the way through the GPU where it is asked for and can be had, else the one through the CPU."""
-    if device == "cuda" or (device == "auto" and has_device()):
-        from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
+    """Return the way through the CPU or the GPU; "auto" is the CPU until the kernels have run on a GPU."""
+    if device != "cuda":
+        return CpuPipeline(settings)
+    from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
 
-        try:
-            return CudaPipeline(settings)
-        except DeviceError:
-            if device == "cuda":
-                raise
-    return CpuPipeline(settings)
+    if settings.scale == 0.25:
+        raise DeviceError("scale must be 1 or 0.5 with device 'cuda', got 0.25")
+    return CudaPipeline(settings)
 
 
 def _mirror(pair: GrayPair) -> GrayPair:
@@ -409,7 +428,8 @@ def warmup(*methods: str, max_disparity: int = 128) -> None:
     """
     image = np.arange(16 * 16, dtype=np.uint8).reshape(16, 16)
     for method in methods or METHODS:
-        Matcher(method, max_disparity=max_disparity)(image, image)
+        with collecting():
+            Matcher(method, max_disparity=max_disparity)(image, image)
 
 
 def _forget_matchers() -> None:

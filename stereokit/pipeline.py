@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from stereokit.costs.rows import Pair, takes_8_bits
 from stereokit.errors import OptionError
 from stereokit.images.gray import GrayPair
-from stereokit.images.resize import half_size, smooth
+from stereokit.images.intensity import scale_guide
+from stereokit.images.resize import reduced, smooth
 from stereokit.kernels.threads import team
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
@@ -77,14 +78,22 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     """
     if settings.refiner is None:
         return coarse
+    further: dict[str, Any] = {}
+    if getattr(settings.refiner, "any_scale", False):
+        further["scale"] = settings.scale
+    if getattr(settings.refiner, "needs_right", False):
+        further["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
     with span("refine", "refine"):
-        full = settings.refiner(coarse, pair.guide, threads=threads)
+        full = settings.refiner(coarse, pair.guide, threads=threads, **further)
     if not isinstance(full, Disparity) or full.disparity.shape != pair.guide.shape:
         got = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
         size = pair.guide.shape
         raise OptionError(f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {got}")
     disparity = full.disparity
-    if settings.floor is not None:
+    if getattr(settings.refiner, "needs_right", False):  # it measures for itself, and may leave the range
+        levels = settings.levels
+        disparity = np.clip(disparity, np.float32(levels.minimum), np.float32(levels.minimum + levels.count - 1))
+    elif settings.floor is not None:
         disparity = np.maximum(disparity, np.float32(settings.floor))
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
@@ -114,7 +123,7 @@ class CpuPipeline:
         cost, aggregation, levels = settings.cost, settings.aggregation, settings.matched_levels
         if settings.scale != 1:
             with span("prepare", "half size"):
-                pair = half_size(pair)
+                pair = reduced(pair, settings.step)
         with span("prepare", "smooth"):
             pair = smooth(pair, settings.smooth, workspace, threads, eight_bits=takes_8_bits(cost))
         shape = pair.left.shape

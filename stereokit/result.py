@@ -19,7 +19,7 @@ from stereokit import io
 from stereokit.calibration import Calibration
 from stereokit.errors import InputError, OptionError
 
-__all__ = ["Disparity", "colorize"]
+__all__ = ["Disparity", "color_range", "colorize"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +64,27 @@ class Disparity:
         if self.candidates is not None:
             _check("candidates", self.candidates, np.float32, (2, *shape))
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return `disparity` where numpy asks for an array: ``np.asarray(result)`` is the map, without a copy."""
+        if copy is None:
+            return np.asarray(self.disparity, dtype)
+        if copy:
+            return np.array(self.disparity, dtype)
+        if dtype is not None and np.dtype(dtype) != self.disparity.dtype:
+            raise ValueError(
+                f"a disparity map of {self.disparity.dtype} cannot become {np.dtype(dtype)} without a copy"
+            )
+        return self.disparity
+
+    def __repr__(self) -> str:
+        height, width = self.disparity.shape
+        known = self.disparity[np.isfinite(self.disparity)]
+        span = f"{known.min():.1f} .. {known.max():.1f} px" if known.size else "no disparity"
+        more = [name for name in ("confidence", "right", "candidates") if getattr(self, name) is not None]
+        return (
+            f"Disparity({height}x{width}, {span}, {100 * self.density:.1f} % measured{''.join(f', {m}' for m in more)})"
+        )
+
     @property
     def density(self) -> float:
         """The share of pixels that were measured, from 0 to 1."""
@@ -80,40 +101,71 @@ class Disparity:
         """Return the points in the left camera's frame, (H, W, 3) float32 metres, NaN where there is none."""
         return calibration.points(self.disparity)
 
-    def color(self, min: float = 0.0, max: float | None = None) -> NDArray[np.uint8]:
+    def color(self, min: float | None = None, max: float | None = None) -> NDArray[np.uint8]:
         """Return the map as a picture, (H, W, 3) uint8 RGB; see `colorize`.
 
         Parameters
         ----------
-        min, max : float
-            Disparities of the first and the last colour, pixels. `max` defaults to the 99th percentile; fix
-            it for video, so that colours keep their meaning.
+        min, max : float, optional
+            Disparities of the first and the last colour, pixels; by default those of `color_range`. Fix them for
+            video, so that colours keep their meaning.
         """
         return colorize(self.disparity, min, max)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, clip: bool = False) -> None:
         """Write `disparity` as ``.png`` (KITTI), ``.pfm``, ``.npy`` or ``.tiff``.
 
         See `stereokit.io.write_disparity`. Filled values are written like measured ones.
 
+        Parameters
+        ----------
+        path : path
+        clip : bool
+            Bring what a ``.png`` cannot say, below 0 and above 65535/256 pixels, to its ends.
+
         Raises
         ------
+        InputError
+            If there are such values, and `clip` is False.
         FileError
             If the suffix is unknown or the file cannot be written.
         """
-        io.write_disparity(path, self.disparity)
+        io.write_disparity(path, self.disparity, clip=clip)
 
 
-def colorize(disparity: ArrayLike, low: float = 0.0, high: float | None = None) -> NDArray[np.uint8]:
+def color_range(disparity: NDArray[Any]) -> tuple[float, float]:
+    """Return the disparities of the first and the last colour where nobody says otherwise, pixels.
+
+    Parameters
+    ----------
+    disparity : array of float
+        Pixels, not finite where invalid.
+
+    Returns
+    -------
+    low, high : float
+        `high` is the 99th percentile of the valid values. `low` is 0 where that leaves these values at least half of
+        the colours, or they are all one; else, for negative and for far ranges, it is the first percentile.
+    """
+    known = disparity[np.isfinite(disparity)]
+    if known.size == 0:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(known, (1, 99)))
+    if low >= 0 and (2 * low <= high or low == high):
+        low = 0.0
+    return (low, high) if high > low else (low, low + 1)
+
+
+def colorize(disparity: ArrayLike, low: float | None = None, high: float | None = None) -> NDArray[np.uint8]:
     """Return a disparity map in Turbo colours.
 
     Parameters
     ----------
     disparity : (H, W) float
         Pixels, not finite where invalid.
-    low, high : float
-        Disparities of the first and the last colour, pixels; what lies outside takes the end's colour. `high`
-        defaults to the 99th percentile of the valid values.
+    low, high : float, optional
+        Disparities of the first and the last colour, pixels; what lies outside takes the end's colour. The defaults
+        are those of `color_range`.
 
     Returns
     -------
@@ -131,8 +183,10 @@ def colorize(disparity: ArrayLike, low: float = 0.0, high: float | None = None) 
     if values.ndim != 2 or values.dtype.kind != "f":
         raise InputError(f"disparity must be (H, W) float, got {values.dtype} of shape {values.shape}")
     known = np.isfinite(values)
+    bottom, top = color_range(values) if low is None or high is None else (low, high)
+    if low is None:
+        low = bottom if high is None or bottom < high else min(0.0, high - 1)
     if high is None:
-        top = float(np.percentile(values[known], 99)) if known.any() else low
         high = top if top > low else low + 1
     if not (np.isfinite(low) and np.isfinite(high) and high > low):
         raise OptionError(f"high must be finite and above low, got low={low}, high={high}")

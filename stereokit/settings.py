@@ -56,11 +56,11 @@ class MatchSettings:
     levels : Levels
         Disparities that are tried, full-size pixels.
     scale : float
-        1 or 0.5: the size at which is matched.
+        1, 0.5 or 0.25: the size at which is matched.
     cost : Cost
     aggregation : Aggregation
     refiner : callable or None
-        What brings the map to full size, where it is matched at half size.
+        What brings the map to full size, or makes it better there.
     refiner_name : str or None
         Its name, or the path of its weights.
     smooth : float
@@ -118,7 +118,7 @@ class MatchSettings:
         if isinstance(self.fill, str) and self.fill == "none":
             put("fill", None)
         if self.fill is not None and (not isinstance(self.fill, str) or self.fill not in FILLS):
-            raise UnknownNameError(did_you_mean("fill", str(self.fill), (*FILLS, "none")))
+            raise UnknownNameError(did_you_mean("fill", self.fill, (*FILLS, "none")))
         put("median", check_integer("median", self.median))
         if self.median not in (0, 3, 5):
             raise OptionError(f"median must be 0, 3 or 5, got {self.median}")
@@ -146,23 +146,23 @@ class MatchSettings:
         if (
             isinstance(scale, bool)
             or not isinstance(scale, (int, float, np.integer, np.floating))
-            or scale not in (1, 0.5)
+            or scale not in (1, 0.5, 0.25)
         ):
-            raise OptionError(f"scale must be 1 or 0.5, got {shown(scale)}")
-        if refiner is not None and scale == 1:
-            raise OptionError(f"refiner needs scale=0.5, got refiner={shown(refiner)} with scale=1")
+            raise OptionError(f"scale must be 1, 0.5 or 0.25, got {shown(scale)}")
         refine: Callable[..., Disparity] | None = None
         refiner_name: str | None = None
         refiner_options: list[str] = []
-        if scale == 0.5:
+        if scale != 1 or refiner is not None:
             refiner_name, factory, refiner_options = find_refiner("linear" if refiner is None else refiner)
             refine = factory(**{k: options[k] for k in refiner_options if k in options})
             options = {k: v for k, v in options.items() if k not in refiner_options}
+            if scale != 0.5 and not getattr(refine, "any_scale", False):
+                raise OptionError(f"refiner {refiner_name!r} needs scale=0.5, got scale={scale:g}")
         cost_name, aggregation_name = method.split("+")
         make_cost, make_aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         of_cost, of_aggregation = option_names(make_cost), option_names(make_aggregation)
         check_names("option", options, sorted({*_PIPELINE, *of_cost, *of_aggregation, *refiner_options}))
-        merged = {**defaults_of(method, half=scale == 0.5), **options}
+        merged = {**defaults_of(method, half=scale != 1), **options}
         cost = make_cost(**{k: merged[k] for k in of_cost if k in merged})
         chosen = {k: merged[k] for k in of_aggregation if k in merged}
         aggregation = make_aggregation(**_fitting(make_aggregation, cost, chosen, options))
@@ -176,16 +176,20 @@ class MatchSettings:
     @property
     def matched_levels(self) -> Levels:
         """The levels of the size at which is matched."""
-        if self.scale == 1:
-            return self.levels
-        low = self.levels.minimum // 2
-        high = max(-(-(self.levels.minimum + self.levels.count) // 2), low + 1)
+        step = self.step
+        low = self.levels.minimum // step
+        high = max(-(-(self.levels.minimum + self.levels.count) // step), low + 1)
         return Levels(low, high - low)
 
     @property
+    def step(self) -> int:
+        """Full-size pixels along a pixel of the size at which is matched."""
+        return round(1 / self.scale)
+
+    @property
     def floor(self) -> int | None:
-        """The minimum, where the levels of half size begin a pixel below it: refined maps are raised to it."""
-        below = self.scale != 1 and 2 * self.matched_levels.minimum < self.levels.minimum
+        """The minimum, where the levels of a smaller size begin below it: refined maps are raised to it."""
+        below = self.step * self.matched_levels.minimum < self.levels.minimum
         return self.levels.minimum if below else None
 
     @property

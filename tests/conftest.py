@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,6 +30,28 @@ from limits import HANG_S  # noqa: E402
 
 settings.register_profile("stereokit", derandomize=True, deadline=None, max_examples=20)
 settings.load_profile("stereokit")
+
+LONGEST = (
+    "stereokit/test_portability", "arm/test_arm", "ptx/test_mutants", "ptx/test_end_to_end", "ptx/test_compile",
+    "refiners/test_training", "evaluation/test_train", "evaluation/test_study", "evaluation/test_batch_dask",
+    "stereokit/test_interrupts", "examples/test_examples", "test_docs", "ptx/test_bench",
+)  # fmt: skip
+"""Files that take longest for their few tests. They come first, or one of two workers ends long before the other."""
+
+
+def pytest_collection_modifyitems(items):
+    def rank(item):
+        return next((k for k, name in enumerate(LONGEST) if f"{name}.py::" in item.nodeid), len(LONGEST))
+
+    items.sort(key=rank)
+
+
+@pytest.fixture(autouse=True)
+def pairs_need_not_be_good():
+    """Let tests match noise, blank images and one image twice; what is warned of is tested with `pytest.warns`."""
+    from stereokit.notices import PairWarning
+
+    warnings.filterwarnings("ignore", category=PairWarning)
 
 
 @pytest.fixture(scope="session")

@@ -235,7 +235,7 @@ def public_modules() -> set[str]:
 
 INTERNAL = re.compile(
     r"stereokit\.(kernels|cuda|images|methods|cli\.(?!app))"
-    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|compose)"
+    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|compose|reference)"
     r"|stereokit_evaluation\.(common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes))"
     r"|.*_cuda$"
 )

@@ -4,12 +4,13 @@ Importing this package imports neither torch nor any runtime: they are loaded wh
 """
 
 from stereokit_refiners.contract import Refiner
-from stereokit_refiners.learned import CnnRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
+from stereokit_refiners.learned import CnnRefiner, EvidenceRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.weights import WeightFile
 
 __all__ = [
     "CnnRefiner",
+    "EvidenceRefiner",
     "LearnedRefiner",
     "Linear",
     "PyramidRefiner",

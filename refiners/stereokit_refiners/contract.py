@@ -41,7 +41,10 @@ class Refiner(Protocol):
 
     One that looks at the matcher's confidence has an attribute ``needs_confidence`` that is True, and one that looks at
     its candidates ``needs_candidates``; others may leave them out. `stereokit.Matcher` then gives it a coarse map with
-    ``confidence``, or with both. One that can work on the GPU has a method
+    ``confidence``, or with both. One that looks at the right image too has a ``needs_right`` that is True, and is
+    called with ``right=``, of the size and type of `left`. One that takes maps of other sizes has an ``any_scale``
+    that is True, and is called with ``scale=``, the size at which was matched: 1, 0.5 or 0.25; rows and columns of
+    the coarse map are those of `left` times that, rounded up. One that can work on the GPU has a method
     ``on_device``, a `DeviceRefiner`, for `stereokit.Matcher.on_device`.
     """
 

@@ -2,7 +2,9 @@
 
 The runtime is whatever is installed: OpenVINO first, then ONNX Runtime, then torch; and the precision what the
 processor is fast at: int8 where it has the instructions and the weights were calibrated, else bfloat16, else fp32.
-Networks compiled for a size are kept, a few at a time.
+Before a process trusts a runtime with a network, it compares a small map with that of plain numpy
+(`stereokit_refiners.runtimes.reference`), and takes another runtime, with a warning, if they disagree. Networks
+compiled for a size are kept, a few at a time.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,23 +22,35 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import OptionError, StereokitError
+from stereokit.errors import DeviceError, OptionError, StereokitError, StereokitWarning
 from stereokit.postprocess import fill
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
-from stereokit_refiners.linear import doubled
+from stereokit_refiners.linear import doubled, enlarged
 from stereokit_refiners.runtimes.compose import compose
-from stereokit_refiners.runtimes.encode import encode
+from stereokit_refiners.runtimes.encode import base_of, encode
+from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.mixture import mixture
+from stereokit_refiners.runtimes.reference import TOLERANCES_PX, input_size, mistake
 from stereokit_refiners.weights import WeightFile, network_named, read, shipped
 
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["BACKENDS", "PRECISIONS", "CnnRefiner", "LearnedRefiner", "PyramidRefiner", "StereoVaeRefiner"]
+__all__ = [
+    "BACKENDS",
+    "PRECISIONS",
+    "CnnRefiner",
+    "EvidenceRefiner",
+    "LearnedRefiner",
+    "PyramidRefiner",
+    "StereoVaeRefiner",
+]
 
 BACKENDS = ("openvino", "onnxruntime", "torch")
 PRECISIONS = ("fp32", "bf16", "int8")
 _KEPT = 4  # compiled networks
+_FEW = 0.01  # of the pixels may lie beyond the disparities of the training
 
 Run = Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]
 """From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
@@ -116,7 +131,7 @@ class LearnedRefiner:
     @property
     def fingerprint(self) -> str:
         """What the result depends on, beside the inputs."""
-        return f"{self._file.fingerprint}-{self.backend}-{self.precision}"
+        return f"{self._file.fingerprint}-{self._compiled.backend}-{self._compiled.precision}"
 
     @property
     def trained_on(self) -> frozenset[str]:
@@ -124,26 +139,57 @@ class LearnedRefiner:
         return frozenset(str(name) for name in self._file.notes.get("frames", ()))
 
     @property
+    def trained_disparities(self) -> tuple[float, float]:
+        """The smallest and the largest disparity of the training, full-size pixels, as the weight file says."""
+        return self._file.disparities
+
+    @property
     def needs_confidence(self) -> bool:
         """Whether the coarse map must come with the matcher's confidence."""
-        return "confidence" in network_named(self._file.network).inputs
+        return not {"confidence", "evidence"}.isdisjoint(network_named(self._file.network).inputs)
 
     @property
     def needs_candidates(self) -> bool:
         """Whether the coarse map must come with the matcher's candidates."""
-        return "candidates" in network_named(self._file.network).inputs
+        return not {"candidates", "evidence"}.isdisjoint(network_named(self._file.network).inputs)
 
-    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
+    @property
+    def needs_right(self) -> bool:
+        """Whether the right image must come too."""
+        return "evidence" in network_named(self._file.network).inputs
+
+    @property
+    def any_scale(self) -> bool:
+        """Whether maps of other sizes than half are taken."""
+        return self.needs_right
+
+    def __call__(
+        self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
+        threads: int = 1,
+    ) -> Disparity:  # fmt: skip
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
 
-        Where the coarse map is NaN, the result is; the network sees it filled. Networks know disparities from 0 on:
-        one whose map goes below sees it lifted by as much.
+        Where the coarse map is NaN, the result is; the network sees it filled. Networks of half-size maps alone know
+        disparities from 0 on:
+        one whose map goes below sees it lifted by as much, one whose map begins far above sees it lowered (see
+        `stereokit_refiners.runtimes.encode.base_of`). No disparity lies beyond the smallest and the largest that the
+        matcher has found.
+
+        Warns
+        -----
+        StereokitWarning
+            Once, if disparities beyond those of the training remain.
         """
+        step = round(1 / scale)
+        wanted = (-(-left.shape[0] // step), -(-left.shape[1] // step))
+        if coarse.disparity.shape != wanted:
+            size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
+            raise OptionError(f"coarse map must be {size} size of left {left.shape}, got {coarse.disparity.shape}")
+        if self.any_scale:
+            return self._weighed(coarse, left, right, step, threads)
         network = network_named(self._file.network)
         rows, columns = left.shape
         height, width = coarse.disparity.shape
-        if (height, width) != (-(-rows // 2), -(-columns // 2)):
-            raise OptionError(f"coarse map must be half the size of left {left.shape}, got {coarse.disparity.shape}")
         disparity = coarse.disparity
         unknown = np.isnan(disparity)
         gaps = bool(unknown.any())
@@ -151,7 +197,9 @@ class LearnedRefiner:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
         below, beside = -height % network.multiple, -width % network.multiple
         candidates = coarse.candidates if self.needs_candidates else None
-        shift = np.float32(min(0.0, *(np.floor(a.min()) for a in (disparity, candidates) if a is not None)))
+        given = [disparity] if candidates is None else [disparity, candidates]
+        shift = base_of(given)  # whole, so that float32 holds it
+        self._check_trained(disparity, shift)
         disparity = _extended((disparity - shift) * np.float32(2), below, beside)
         confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
         image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
@@ -159,8 +207,9 @@ class LearnedRefiner:
         inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
         head = self._compiled.run(inputs, threads)
         full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
-        if shift < 0:
+        if shift != 0:
             full += 2 * shift
+        np.clip(full, 2 * min(a.min() for a in given), 2 * max(a.max() for a in given), out=full)
         known = doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
         if gaps:
             missing = doubled(unknown.view(np.uint8), rows, columns).astype(bool)
@@ -169,10 +218,59 @@ class LearnedRefiner:
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
+    def _check_trained(self, disparity: NDArray[np.float32], shift: float) -> None:
+        """Warn, once, where a map in half-size pixels, lowered by `shift`, goes beyond what was trained."""
+        low, high = self.trained_disparities
+        share = np.count_nonzero(disparity - shift > high / 2) / disparity.size
+        if share > _FEW and not self._compiled.warned:
+            self._compiled.warned = True
+            lowered = f", {2 * shift:g} px taken off" if shift > 0 else ""
+            warnings.warn(
+                f"refiner {self._file.network!r} was trained on disparities from {low:g} to {high:g} px, "
+                f"{100 * share:.0f} % of this map lie beyond{lowered}: they come out 1 to 2 % too small; "
+                "refiner 'linear' takes any",
+                StereokitWarning,
+                stacklevel=3,
+            )
+
+    def _weighed(
+        self, coarse: Disparity, left: NDArray[Any], right: NDArray[Any] | None, step: int, threads: int
+    ) -> Disparity:
+        """Return the map of a network that weighs values by evidence from both images."""
+        rows, columns = left.shape
+        if right is None or right.shape != left.shape:
+            got = "none" if right is None else right.shape
+            raise OptionError(f"right must have the size of left {left.shape} for this refiner, got {got}")
+        if coarse.confidence is None or coarse.candidates is None:
+            raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+        disparity = coarse.disparity
+        unknown = np.isnan(disparity)
+        gaps = bool(unknown.any())
+        if gaps:
+            disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
+        found = hypotheses(disparity, coarse.candidates, left, right, step, threads)
+        inputs = {"evidence": network_input(found, coarse.confidence, left, columns, threads)}
+        full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
+        known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
+        if gaps:
+            missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
+            full[missing] = np.nan
+            known &= ~missing
+        return Disparity(full, known, sure)
+
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
+        if self.needs_right:
+            raise DeviceError(f"refiner {self._file.network!r} does not work on the device yet: match host images")
         found: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceRefiner(LearnedRefiner):
+    """The one for every camera: see `stereokit_refiners.networks.evidence`."""
+
+    architecture: ClassVar[str] = "evidence"
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,15 +304,24 @@ def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArra
     return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
 
 
-def _backend(name: str) -> str:
-    if name != "auto" and name not in BACKENDS:
-        raise OptionError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
+def _installed() -> list[str]:
+    """Return the runtimes that are there, the best first."""
     there = [b for b in BACKENDS if importlib.util.find_spec(b) is not None]
     if "onnxruntime" in there and importlib.util.find_spec("onnx") is None:
         there.remove("onnxruntime")
+    return there
+
+
+def _backend(name: str) -> str:
+    if name != "auto" and name not in BACKENDS:
+        raise OptionError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
+    there = _installed()
     if name == "auto":
         if not there:
-            raise StereokitError("learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[fast]'")
+            raise StereokitError(
+                "learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[fast]', or "
+                "'stereokit[onnx]' where OpenVINO has no wheel"
+            )
         return there[0]
     if name not in there:
         extra = {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}[name]
@@ -241,36 +348,77 @@ def _precision(name: str, backend: str, content: WeightFile) -> str:
     return "bf16" if features.get("avx512bf16") or features.get("amx-bf16") else "fp32"
 
 
+_sound: dict[tuple[str, str, str], tuple[str, str]] = {}
+_sound_lock = threading.Lock()
+
+
+def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, str]:
+    """Return the backend and precision to run a network with: those given, if they compute it rightly here.
+
+    Checked once a process for each network, with the weights that come first.
+
+    Raises
+    ------
+    StereokitError
+        If no runtime that is installed does.
+    """
+    key = content.network, backend, precision
+    with _sound_lock:
+        if key not in _sound:
+            wrong = []
+            ways = [(backend, precision), *((b, "fp32") for b in _installed() if (b, "fp32") != (backend, precision))]
+            for way in ways:
+                off = mistake(content, _compile(content, *way, *input_size(content), 1))
+                if off <= TOLERANCES_PX[way[1]]:
+                    break
+                wrong.append(f"{way[0]} in {way[1]} is off by {off:.3g} px on average")
+            else:
+                told = "; ".join(wrong)
+                raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {told}")
+            if wrong:
+                told = f"since on this machine {'; '.join(wrong)}"
+                told = f"network {content.network!r} is run by {way[0]} in {way[1]}, {told}"
+                warnings.warn(told, RuntimeWarning, stacklevel=5)
+            _sound[key] = way
+        return _sound[key]
+
+
+def _compile(content: WeightFile, backend: str, precision: str, rows: int, columns: int, threads: int) -> Run:
+    network = network_named(content.network)
+    if backend == "openvino":
+        from stereokit_refiners.runtimes.openvino import compiled
+
+        ranges = content.ranges if precision == "int8" else None
+        return compiled(network, content.arrays, rows, columns, threads, precision, ranges)
+    if backend == "onnxruntime":
+        from stereokit_refiners.runtimes.onnx import session
+
+        return session(network, content.arrays, threads)
+    from stereokit_refiners.runtimes.torch import runner
+
+    return runner(network, content.arrays)
+
+
 class _Compiled:
-    """The compiled networks of one refiner, by size and threads."""
+    """The compiled networks of one refiner, by size and threads; `backend` and `precision` are what runs them."""
 
     def __init__(self, content: WeightFile, backend: str, precision: str) -> None:
         self.content, self.backend, self.precision = content, backend, precision
         self._held: OrderedDict[tuple[int, int, int], Run] = OrderedDict()
         self._lock = threading.Lock()
+        self.warned = False
 
     def run(self, inputs: dict[str, NDArray[np.float32]], threads: int) -> NDArray[np.float32]:
         """Return the head for encoded inputs."""
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)
         with self._lock:
-            runner = self._held.pop(key, None) or self._compile(rows, columns, threads)
+            if not self._held:
+                self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
+            runner = self._held.pop(key, None) or _compile(
+                self.content, self.backend, self.precision, rows, columns, threads
+            )
             self._held[key] = runner
             while len(self._held) > _KEPT:
                 self._held.popitem(last=False)
         return runner(inputs)
-
-    def _compile(self, rows: int, columns: int, threads: int) -> Run:
-        network = network_named(self.content.network)
-        if self.backend == "openvino":
-            from stereokit_refiners.runtimes.openvino import compiled
-
-            ranges = self.content.ranges if self.precision == "int8" else None
-            return compiled(network, self.content.arrays, rows, columns, threads, self.precision, ranges)
-        if self.backend == "onnxruntime":
-            from stereokit_refiners.runtimes.onnx import session
-
-            return session(network, self.content.arrays, threads)
-        from stereokit_refiners.runtimes.torch import runner
-
-        return runner(network, self.content.arrays)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -24,22 +24,25 @@ from stereokit_refiners.contract import on_tensors
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["Linear", "doubled", "upscaled"]
+__all__ = ["Linear", "doubled", "enlarged", "upscaled"]
 
 
 @dataclass(frozen=True)
 class Linear:
-    """Bilinear upscaling by two; the left image is used for its size only."""
+    """Bilinear upscaling; the left image is used for its size only."""
 
-    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:
+    any_scale: ClassVar[bool] = True
+
+    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1, scale: float = 0.5) -> Disparity:
         """Return the map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
         height, width = left.shape
-        disparity = upscaled(coarse.disparity, 2, height, width, threads)
-        valid = doubled(coarse.valid.view(np.uint8), height, width).astype(bool)
+        step = round(1 / scale)
+        disparity = _upscaled_by(step, coarse.disparity, step, height, width, threads)
+        valid = enlarged(coarse.valid.view(np.uint8), step, height, width).astype(bool)
         valid &= ~np.isnan(disparity)
         confidence = None
         if coarse.confidence is not None:
-            confidence = upscaled(coarse.confidence, 1, height, width, threads)
+            confidence = _upscaled_by(step, coarse.confidence, 1, height, width, threads)
             confidence[~valid] = 0
         return Disparity(disparity, valid, confidence)
 
@@ -51,9 +54,25 @@ class Linear:
 
 def doubled(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
     """Return each pixel four times, cut to a size."""
-    size = (2 * image.shape[1], 2 * image.shape[0])
+    return enlarged(image, 2, rows, columns)
+
+
+def enlarged(image: NDArray[Any], step: int, rows: int, columns: int) -> NDArray[Any]:
+    """Return each pixel ``step * step`` times, cut to a size."""
+    size = (step * image.shape[1], step * image.shape[0])
     large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)).reshape(size[1], size[0])
     return np.ascontiguousarray(large[:rows, :columns])
+
+
+def _upscaled_by(
+    step: int, image: NDArray[np.float32], gain: float, rows: int, columns: int, threads: int
+) -> NDArray[np.float32]:
+    """Return `gain` times an image at `step` times its size, bilinearly, cut to a size: a copy, or as `upscaled`."""
+    if step == 2:
+        return upscaled(image, gain, rows, columns, threads)
+    size = (step * image.shape[1], step * image.shape[0])
+    large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)).reshape(size[1], size[0])
+    return np.asarray(large[:rows, :columns] * np.float32(gain), np.float32)
 
 
 def upscaled(image: NDArray[np.float32], gain: float, rows: int, columns: int, threads: int = 1) -> NDArray[np.float32]:

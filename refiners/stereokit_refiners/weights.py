@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -19,17 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError, did_you_mean
-from stereokit.io import write_bytes
+from stereokit.io import parsing, write_bytes
+from stereokit_refiners.networks.evidence import Evidence
 from stereokit_refiners.networks.layers import Network, activations, shapes
 from stereokit_refiners.networks.pyramid import Pyramid
 from stereokit_refiners.networks.stereovae import NonVae, StereoVae
 
 __all__ = ["NETWORKS", "WeightFile", "network_named", "read", "shipped", "write"]
 
-NETWORKS: dict[str, Network] = {network.name: network for network in (StereoVae(), NonVae(), Pyramid())}
+NETWORKS: dict[str, Network] = {network.name: network for network in (StereoVae(), NonVae(), Pyramid(), Evidence())}
 """Architectures by name."""
 
 _FORMAT = "stereokit-refiner/2"
+_DISPARITIES = (0.0, 128.0)  # of the training of files that do not say
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +48,7 @@ class WeightFile:
     ranges : dict of lists of float
         Largest absolute value of each channel of each activation, for int8; empty when it was not calibrated.
     notes : dict
-        How it was trained: free, JSON.
+        How it was trained: free, JSON. ``"disparities"`` are the smallest and the largest of the training, pixels.
     """
 
     network: str
@@ -53,6 +56,12 @@ class WeightFile:
     arrays: Mapping[str, NDArray[np.float32]]
     ranges: Mapping[str, list[float]] = field(default_factory=dict)
     notes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def disparities(self) -> tuple[float, float]:
+        """The smallest and the largest disparity of the training, full-size pixels."""
+        low, high = self.notes.get("disparities", _DISPARITIES)
+        return float(low), float(high)
 
     @property
     def fingerprint(self) -> str:
@@ -117,24 +126,29 @@ def read(path: str | Path) -> WeightFile:
     """
     library = _library()
     text = str(path)
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise FileError(f"weights must name a file, got {text!r}, which is not there")
-    try:
-        with library.safe_open(text, framework="np") as held:
-            metadata = held.metadata() or {}
-            arrays = {name: held.get_tensor(name) for name in held.keys()}
-    except Exception as error:  # the library raises its own types
-        raise FileError(f"weights must be a safetensors file, got {text!r} ({' '.join(str(error).split())})") from None
+    with (
+        parsing(path, "weights", "weights must be a safetensors file"),
+        library.safe_open(text, framework="np") as held,
+    ):
+        metadata = held.metadata() or {}
+        arrays = {name: held.get_tensor(name) for name in held.keys()}
     if metadata.get("format") != _FORMAT:
         raise FileError(f"weights must have the format {_FORMAT!r}, got {metadata.get('format')!r} in {text!r}")
     name, form = metadata.get("network", ""), metadata.get("form", "")
-    try:
+    with parsing(path, "weights", "weights must hold ranges and notes as JSON"):
         ranges = {str(k): [float(x) for x in v] for k, v in json.loads(metadata.get("ranges", "{}")).items()}
-        notes = dict(json.loads(metadata.get("notes", "{}")))
-    except (ValueError, TypeError, AttributeError):
-        raise FileError(f"weights must hold ranges and notes as JSON, got something else in {text!r}") from None
+        notes = json.loads(metadata.get("notes", "{}"))
+        if not isinstance(notes, dict) or not _are_names(notes.get("frames", [])):
+            raise ValueError("notes are an object, whose frames are names")
     _check(text, name, form, arrays, ranges)
+    _check_disparities(text, notes)
     return WeightFile(name, form, arrays, ranges, notes)
+
+
+def _are_names(frames: Any) -> bool:
+    return isinstance(frames, list) and all(isinstance(name, str) for name in frames)
 
 
 def shipped(name: str) -> WeightFile:
@@ -149,6 +163,14 @@ def shipped(name: str) -> WeightFile:
     if not path.is_file():
         raise FileError(f"no weights for {name!r} come with this version")
     return read(str(path))
+
+
+def _check_disparities(path: str, notes: Mapping[str, Any]) -> None:
+    """Raise FileError unless the disparities of the training, if the notes have them, are two numbers in order."""
+    given = notes.get("disparities", _DISPARITIES)
+    numbers = isinstance(given, (list, tuple)) and len(given) == 2 and all(type(x) in (int, float) for x in given)
+    if not numbers or not -math.inf < given[0] < given[1] < math.inf:
+        raise FileError(f"disparities in notes must be two numbers, the smaller first, got {given!r} in {path!r}")
 
 
 def _check(

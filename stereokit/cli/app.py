@@ -5,14 +5,22 @@ function with typer annotations. It is imported only when its command (or the li
 for, and one that cannot be imported says so without harming the rest. Everything heavy is imported inside the
 functions.
 
-Bad input ends with one line, ``error: ...``, on standard error and exit status 2; an interrupt with 130.
+Bad input ends with one line, ``error: ...``, on standard error and exit status 2; an interrupt with 130. What looks
+wrong but stops nothing is one line, ``warning: ...``. A request to end (SIGTERM, SIGHUP) is an interrupt, so that no
+half-written file stays behind, and the process then ends by that signal.
 """
 
 from __future__ import annotations
 
 import inspect
+import io
+import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from typing import Annotated, Any
 
@@ -22,7 +30,8 @@ from typer.core import TyperGroup
 from stereokit.cli.info import info, list_
 from stereokit.cli.match import match
 from stereokit.cli.output import version_of
-from stereokit.errors import StereokitError
+from stereokit.errors import StereokitError, one_line
+from stereokit.notices import collecting
 
 __all__ = ["app", "main"]
 
@@ -45,7 +54,8 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with collecting(_tell):
+                return super().invoke(ctx)
         except StereokitError as error:
             _fail(str(error), error)
         except ModuleNotFoundError as error:
@@ -71,10 +81,43 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; the console entry point."""
+    from stereokit.io.quiet import keep_stderr
+
+    keep_stderr()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what is no text
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # what libraries have to say to programmers
+        warnings.filterwarnings("default", module="stereokit")
+    warnings.showwarning = lambda message, *_, **__: _tell(str(message))
+    with _ending_by_signal():
+        try:
+            app(prog_name="stereokit")
+        except KeyboardInterrupt:
+            sys.exit(130)
+
+
+@contextmanager
+def _ending_by_signal() -> Iterator[None]:
+    """Take a request to end as an interrupt, so that what is under way is cleared away, and then end by it."""
+    received: list[int] = []
+
+    def end(number: int, frame: object) -> None:
+        received.append(number)
+        if len(received) == 1:  # it may come again meanwhile, as from `timeout`
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+                signal.signal(number, end)
     try:
-        app(prog_name="stereokit")
-    except KeyboardInterrupt:
-        sys.exit(130)
+        yield
+    finally:
+        if received:
+            signal.signal(received[0], signal.SIG_DFL)
+            os.kill(os.getpid(), received[0])
 
 
 def _print_version(wanted: bool) -> None:
@@ -121,5 +164,9 @@ def _plugin(entry: metadata.EntryPoint) -> Any:
 
 
 def _fail(message: str, error: BaseException) -> None:
-    typer.echo(f"error: {' '.join(message.splitlines())}", err=True)
+    typer.echo(f"error: {one_line(message)}", err=True)
     raise typer.Exit(2) from error
+
+
+def _tell(line: str) -> None:
+    typer.echo(f"warning: {one_line(line)}", err=True)

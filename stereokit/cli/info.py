@@ -5,10 +5,8 @@ from __future__ import annotations
 import platform
 from typing import Any
 
-from rich.table import Table
-
 from stereokit.cli.options import JsonOption, check_json
-from stereokit.cli.output import report, version_of
+from stereokit.cli.output import Table, report, version_of
 
 __all__ = ["info", "list_"]
 

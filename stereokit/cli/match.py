@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from stereokit.cli.options import (
     DeviceOption,
@@ -25,8 +24,9 @@ from stereokit.cli.options import (
     described,
     parse_settings,
 )
-from stereokit.cli.output import report, version_of, waiting
+from stereokit.cli.output import Table, report, version_of, waiting
 from stereokit.errors import InputError, OptionError
+from stereokit.notices import collecting
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -117,7 +117,7 @@ def match(
     from stereokit.matching import Matcher
 
     matcher = Matcher(method, **matching, **chosen)
-    images = io.read_image(left), io.read_image(right_image)
+    images = io.read_pair(left, right_image)
     height, width = images[0].shape[:2]
     if images[1].shape[:2] != (height, width):
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
@@ -126,16 +126,17 @@ def match(
 
     with waiting("Matching (the first run also compiles) ..."):
         small = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
-        matcher(*small)  # compiles, so that the time below is that of matching
+        with collecting():
+            matcher(*small)  # compiles, so that the time below is that of matching
         start = time.perf_counter()
         result = matcher(*images)
         seconds = time.perf_counter() - start
 
-    result.save(output)
+    result.save(output, clip=True)  # its range was checked; a refiner may add a pixel
     if color is not None:
         io.write_image(color, result.color())
     if right is not None:
-        io.write_disparity(right, _present(result.right, "--right", matcher.method))
+        io.write_disparity(right, _present(result.right, "--right", matcher.method), clip=True)
     if confidence is not None:
         _write_confidence(confidence, _present(result.confidence, "--confidence", matcher.method))
     if ply is not None and camera is not None:
@@ -177,9 +178,7 @@ def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height
         return None
     from stereokit.calibration import read_calibration
 
-    camera = read_calibration(path, cameras)
-    camera.check_size(width, height)
-    return camera
+    return read_calibration(path, cameras, (width, height))
 
 
 def _present(array: NDArray[Any] | None, option: str, method: str) -> NDArray[Any]:
@@ -204,10 +203,10 @@ def _write_cloud(path: Path, result: Disparity, camera: Calibration, image: NDAr
     import numpy as np
 
     from stereokit import io
+    from stereokit.images.intensity import display_8bit
 
     points = result.points(camera)
     kept = np.isfinite(points).all(axis=2)
-    white = {"uint8": 255.0, "uint16": 65535.0}.get(str(image.dtype)) or max(float(np.nanmax(image)), 1e-9)
-    colors = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
-    scaled = np.rint(np.clip(np.nan_to_num(colors[kept] / white), 0, 1) * 255).astype(np.uint8)
-    io.write_ply(path, points[kept], scaled)
+    shown = display_8bit(image)
+    colors = shown if shown.ndim == 3 else np.repeat(shown[:, :, None], 3, axis=2)
+    io.write_ply(path, points[kept], colors[kept])

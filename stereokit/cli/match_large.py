@@ -8,9 +8,9 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
 from stereokit.cli.options import described
+from stereokit.cli.output import Table
 from stereokit.large.matching import OVERLAP, match_large
 
 __all__ = ["match_in_windows"]

@@ -44,7 +44,7 @@ MinDisparityOption = Annotated[int, typer.Option(help="Disparities searched star
 ScaleOption = Annotated[float, typer.Option(help="Match at this size, such as 0.5.")]
 RefinerOption = Annotated[str | None, typer.Option(help="Brings a scaled map to full size; see list.")]
 FillOption = Annotated[str | None, typer.Option(help="Of invalid pixels: nearest, background, none.")]
-DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+DeviceOption = Annotated[str, typer.Option(help="auto (the CPU, for now), cpu or cuda.")]
 SettingsOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage, such as p1=10.")
 ]

@@ -9,12 +9,30 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from rich import table
 from rich.console import Console
-from rich.table import Table
+from rich.text import Text
 
 from stereokit.cli.options import write_json
+from stereokit.errors import one_line
 
-__all__ = ["report", "version_of", "waiting"]
+__all__ = ["Table", "report", "version_of", "waiting"]
+
+
+class Table(table.Table):
+    """A table of words as they are: paths and names may hold what looks like rich's markup, or cannot be printed."""
+
+    def __init__(self, *heads: str, title: str | None = None, **options: Any) -> None:
+        super().__init__(*heads, title=None if title is None else Text(one_line(title), "table.title"), **options)
+
+    def add_column(self, header: Any = "", *arguments: Any, **options: Any) -> None:
+        """Add a column; its head is shown as it is, and what is too long for it goes on in the next line."""
+        options.setdefault("overflow", "fold")
+        super().add_column(Text(one_line(header)) if isinstance(header, str) else header, *arguments, **options)
+
+    def add_row(self, *cells: Any, **options: Any) -> None:
+        """Add a row; what is no renderable of rich's is shown as it is."""
+        super().add_row(*(Text(one_line(cell)) if isinstance(cell, str) else cell for cell in cells), **options)
 
 
 def version_of(package: str) -> str | None:
@@ -34,8 +52,8 @@ def report(content: dict[str, Any], tables: list[Table], path: Path | None) -> N
     if write_json(path, content):
         return
     console = Console()
-    for table in tables:
-        console.print(table)
+    for part in tables:
+        console.print(part)
 
 
 @contextmanager

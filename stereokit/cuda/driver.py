@@ -1,7 +1,7 @@
 """Whether there is a GPU: asked of the driver itself, so that asking imports nothing.
 
-``device="auto"`` must not pay for numba.cuda on a machine without a GPU, and ``device="cuda"`` must say in one line
-what is missing there.
+``stereokit info`` must not pay for numba.cuda on a machine without a GPU, and ``device="cuda"`` must say in one line
+what is missing there. ``device="auto"`` does not ask: it is the CPU until the kernels have run on a GPU.
 """
 
 from __future__ import annotations

@@ -58,6 +58,8 @@ def check_nodata(value: Any) -> float | None:
         return None
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise OptionError(f"nodata must be a number or None, got {shown(value)}")
+    if isinstance(value, int) and abs(value) > 2**64:  # no pixel holds it, nor can a float
+        raise OptionError(f"nodata must be a value that pixels can have, got {shown(value)}")
     return None if np.isnan(value) else float(value)
 
 
@@ -65,7 +67,7 @@ def check_names(kind: str, given: Any, known: Any) -> None:
     """Raise OptionError with the nearest known name for the first of `given` that is not in `known`."""
     for name in given:
         if name not in known:
-            raise OptionError(did_you_mean(kind, str(name), known))
+            raise OptionError(did_you_mean(kind, name, known))
 
 
 def writable(array: Any) -> NDArray[Any]:

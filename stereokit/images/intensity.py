@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,8 +25,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import StereokitWarning
 from stereokit.images.check import checked_image
+from stereokit.notices import collecting, warn
 
 __all__ = ["Blocks", "Tone", "display_8bit", "fill_bad", "find_tone", "missing_pixels", "scale_guide", "to_gray"]
 
@@ -197,11 +196,12 @@ def display_8bit(image: Any, nodata: float | None = None) -> NDArray[np.uint8]:
     missing = missing_pixels(array, nodata)
     colors = array[:, :, :3] if array.ndim == 3 else array
     plane = colors.reshape(colors.shape[0], -1)  # colours side by side: one range for all
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", StereokitWarning)
+    with collecting():
         tone = find_tone(lambda: [(0, plane)], plane.dtype, plane.shape, nodata)
     gray, unknown = tone.apply(plane)
     shown: NDArray[np.uint8] = tone.guide(gray).reshape(colors.shape).copy()
+    if tone.low == tone.high > 0:  # one level: white
+        shown[:] = 255
     if unknown is not None:
         shown.reshape(plane.shape)[unknown] = 0
     if missing is not None:
@@ -352,9 +352,7 @@ def _check_levels(sample: NDArray[Any], low: float, high: float) -> None:
     held = 1 + int(np.searchsorted(np.cumsum(counts), _MOST * sample.size))
     different = 1 + np.count_nonzero(sample[1:] != sample[:-1])
     if held < _LEVELS and different > 2 * held:
-        warnings.warn(
+        warn(
             f"left and right: {held} of 256 grey levels hold 99 % of the pixels between {low:g} and {high:g}; if "
-            "some of these values mark missing pixels, give it as nodata",
-            StereokitWarning,
-            stacklevel=4,
+            "some of these values mark missing pixels, give it as nodata"
         )

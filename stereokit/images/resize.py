@@ -14,7 +14,7 @@ from stereokit.images.intensity import scale_guide
 from stereokit.kernels.threads import run
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["half_size", "smooth"]
+__all__ = ["half_size", "reduced", "smooth"]
 
 
 def smooth(
@@ -55,6 +55,13 @@ def smooth(
     run([partial(blur, 0), partial(blur, 1)], threads)
     left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
     return GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide, pair.ranges, pair.span)
+
+
+def reduced(pair: GrayPair, step: int) -> GrayPair:
+    """Return the pair at 1/`step` of its size, 1, 2 or 4: halved as often as that takes."""
+    while step > 1:
+        pair, step = half_size(pair), step // 2
+    return pair
 
 
 def half_size(pair: GrayPair) -> GrayPair:

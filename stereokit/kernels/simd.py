@@ -39,6 +39,7 @@ __all__ = [
     "choose",
     "convert",
     "count_bits",
+    "count_ones",
     "either",
     "first_bit",
     "first_lane",
@@ -317,6 +318,18 @@ def count_bits(typing: Any, value: Any) -> Any:
         return _call(builder, f"llvm.ctpop.{value.suffix}", value.llvm, [args[0]])
 
     return value(value), generate
+
+
+@intrinsic
+def count_ones(typing: Any, value: Any) -> Any:
+    """Return the number of bits set in one ``uint32``, as ``int32``; loops over it become vector code."""
+    if value != types.uint32:
+        return None
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _call(builder, "llvm.ctpop.i32", _I32, [args[0]])
+
+    return types.int32(types.uint32), generate
 
 
 def _low_bytes(builder: Any, value: Any) -> Any:

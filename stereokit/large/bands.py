@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.checks import same_pixels
 from stereokit.images.intensity import Tone
 from stereokit.large.plan import Cut, Plan
 from stereokit.large.sources import Source
@@ -42,18 +43,20 @@ class Bands:
     ----------
     measured : int
         Pixels so far that were measured.
+    same : bool
+        Whether both views were the same so far.
     """
 
     def __init__(
         self, matcher: Matcher, sources: tuple[Source, Source], tone: Tone, ranges: Ranges | None, windows: Plan,
         progress: Callable[[int, int], object] | None,
     ) -> None:  # fmt: skip
-        self.measured = 0
+        self.measured, self.same = 0, True
         self._wanted, self._sources, self._tone, self._ranges = matcher, sources, tone, ranges
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
         self._matcher = _for_windows(matcher, (self._height, self._width), windows.window)
-        self._halo = matcher.settings.median // 2 if matcher.scale == 1 else 0
+        self._halo = matcher.settings.median // 2 if matcher.refiner is None else 0
         self._last: NDArray[np.float32] | None = None  # row that a band without any valid pixel is filled from
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
@@ -77,6 +80,7 @@ class Bands:
         """Match one window and put what is kept of it into a band that begins at row `top`."""
         window = row.start, row.stop, column.start, column.stop
         pair = read_pair(*self._sources, self._tone, window, self._ranges)
+        self.same = self.same and same_pixels(pair.left, pair.right)
         found = self._matcher.match_gray(pair, self._matcher.threads)
         kept = slice(column.first - column.start, column.last - column.start)
         rows = slice(top - row.start, top - row.start + len(band))
@@ -85,7 +89,7 @@ class Bands:
 
     def _finished(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
         settings = self._wanted.settings
-        if settings.scale != 1:
+        if settings.refiner is not None:
             return band
         filled = settings.fill is not None
         if filled:
@@ -101,10 +105,10 @@ class Bands:
 
 def _for_windows(matcher: Matcher, image: tuple[int, int], window: tuple[int, int]) -> Matcher:
     """Return a matcher whose largest speckle has as many pixels as in the whole image, and that leaves filling."""
-    step = 1 if matcher.scale == 1 else 2
+    step = matcher.settings.step
     whole, part = (-(-height // step) * -(-width // step) for height, width in (image, window))
     speckle = matcher.settings.speckle
     changes: dict[str, Any] = {"speckle": min(1.0, (int(speckle * whole) + 0.5) / part)} if speckle else {}
-    if matcher.scale == 1:
+    if matcher.refiner is None:
         changes.update(fill=None, median=0)
     return matcher.replaced(**changes)

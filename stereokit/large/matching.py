@@ -18,10 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from stereokit.checks import doubts_about_density, doubts_about_views
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer
 from stereokit.images.gray import check_same
 from stereokit.images.intensity import Tone
+from stereokit.io.images import doubt_orientations
 from stereokit.large.bands import Bands
 from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes
 from stereokit.large.output import check_large_output, write_bands
@@ -29,6 +31,7 @@ from stereokit.large.plan import Plan, plan
 from stereokit.large.sources import Source, open_source
 from stereokit.large.tones import BLOCK_NBYTES, Ranges, find_ranges, tone_of
 from stereokit.matching import Matcher
+from stereokit.notices import PairWarning, warn
 
 __all__ = ["OVERLAP", "LargeResult", "match_large"]
 
@@ -129,6 +132,11 @@ def match_large(
     -------
     LargeResult
 
+    Warns
+    -----
+    PairWarning
+        If both images are the same, their orientation tags differ, or hardly anything could be measured.
+
     Raises
     ------
     InputError, OptionError, FileError
@@ -144,16 +152,20 @@ def match_large(
     limit = None if memory is None else parse_memory(memory)
     sources = open_source("left", left), open_source("right", right)
     check_same(*sources)
+    doubt_orientations(sources[0].orientation, sources[1].orientation)
     tone = tone_of(*sources, matcher.settings.nodata)
     height, width = sources[0].shape[:2]
     windows = _plan(matcher, sources, tone, overlap, limit, target)
     ranges: Ranges | None = None
     if getattr(matcher.cost, "needs_ranges", False):
-        ranges = find_ranges(*sources, tone, matcher.scale != 1, matcher.settings.smooth, matcher.threads)
+        ranges = find_ranges(*sources, tone, matcher.settings.step, matcher.settings.smooth, matcher.threads)
     bands = Bands(matcher, sources, tone, ranges, windows, progress)
     write_bands(target, height, width, bands)
     total = len(windows.rows) * len(windows.columns)
     density = bands.measured / (height * width)
+    views = doubts_about_views(bands.same)
+    for line in views or doubts_about_density(density, matcher.min_disparity, matcher.max_disparity):
+        warn(line, PairWarning)
     return LargeResult(target, height, width, windows.window, total, overlap, density, matcher)
 
 

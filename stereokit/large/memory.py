@@ -13,6 +13,7 @@ from stereokit.errors import OptionError
 __all__ = ["free_nbytes", "parse_memory", "resident_nbytes"]
 
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
+_MOST_NBYTES = 2**63
 
 
 def parse_memory(memory: Any) -> int:
@@ -23,13 +24,14 @@ def parse_memory(memory: Any) -> int:
     OptionError
         If it is neither.
     """
+    given = memory
     if isinstance(memory, str):
         found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]*)?)\s*([kmgt]?i?)b?\s*", memory.lower())
         if found is not None and found[2] in _UNITS:
-            return int(float(found[1]) * _UNITS[found[2]])
-    elif not isinstance(memory, bool) and isinstance(memory, (int, float, np.number)) and 0 < memory < float("inf"):
+            memory = float(found[1]) * _UNITS[found[2]]
+    if not isinstance(memory, bool) and isinstance(memory, (int, float, np.number)) and 0 < memory <= _MOST_NBYTES:
         return int(memory)
-    raise OptionError(f"memory must be a number of bytes or such as '2GB', got {memory!r}")
+    raise OptionError(f"memory must be a number of bytes or such as '2GB', got {str(given)[:40]!r}")
 
 
 def resident_nbytes() -> int:

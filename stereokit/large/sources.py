@@ -1,6 +1,7 @@
 """Images that are read a window at a time: arrays, memory-mapped ``.npy``, and TIFF tile by tile.
 
-Of a TIFF only the tiles (or strips) that a window touches are decoded. Any other image file is read whole and held.
+Of a TIFF only the tiles (or strips) that a window touches are decoded. Any other image file is read whole and held, and
+so is a TIFF whose tiles are not what is shown: a palette, planes, inverted greys.
 A mapped file is mapped anew for each window: pages of a mapping that lives on count as memory of the process.
 """
 
@@ -15,11 +16,13 @@ from numpy.typing import NDArray
 
 from stereokit.errors import FileError, StereokitError
 from stereokit.images.check import checked_image
-from stereokit.io import read_image
+from stereokit.io import parsing, read_npy
+from stereokit.io.images import NPY_START, TIFF_STARTS, open_tiff, read_oriented
+from stereokit.io.orientation import UPRIGHT, oriented, stored_window
 
 __all__ = ["Source", "open_source"]
 
-_TIFF = (".tif", ".tiff")
+_ORIENTATION = 0x0112
 
 
 class Source(Protocol):
@@ -37,6 +40,8 @@ class Source(Protocol):
         Bytes that reading one piece takes beside the window.
     held_nbytes : int
         Bytes that the source itself holds in memory.
+    orientation : int
+        The tag that was applied, 1 to 8.
     """
 
     shape: tuple[int, ...]
@@ -44,6 +49,7 @@ class Source(Protocol):
     row_step: int
     piece_nbytes: int
     held_nbytes: int
+    orientation: int
 
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
         """Return rows y0 to y1 of columns x0 to x1."""
@@ -58,7 +64,7 @@ def open_source(name: str, image: Any) -> Source:
     name : str
         What messages call the argument.
     image : (H, W) or (H, W, 3) array, or path
-        ``.npy`` is mapped, of ``.tif`` and ``.tiff`` tiles are decoded as needed, other files are read whole.
+        An npy file is mapped, of a TIFF tiles are decoded as needed, other files are read whole.
 
     Raises
     ------
@@ -72,13 +78,16 @@ def open_source(name: str, image: Any) -> Source:
     if not isinstance(image, (str, os.PathLike)):
         return _Array(checked_image(name, image), 0)
     path = Path(image)
-    suffix = path.suffix.lower()
-    if suffix == ".npy":
+    with parsing(path, "image"), path.open("rb") as file:
+        start = file.read(8)
+    if start.startswith(NPY_START):
         return _Mapped(name, path)
-    if suffix in _TIFF:
-        return _Tiff(name, path)
-    whole = checked_image(name, read_image(path))
-    return _Array(whole, whole.nbytes)
+    page = _tiled(name, path) if start.startswith(TIFF_STARTS) else None
+    if page is not None:
+        return _Tiff(name, path, page)
+    whole, orientation = read_oriented(path)
+    whole = checked_image(name, whole)
+    return _Array(whole, whole.nbytes, orientation)
 
 
 def _checked(name: str, shape: tuple[int, ...], dtype: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -90,8 +99,9 @@ def _checked(name: str, shape: tuple[int, ...], dtype: Any) -> tuple[tuple[int, 
 class _Array:
     row_step, piece_nbytes = 1, 0
 
-    def __init__(self, array: NDArray[Any], held_nbytes: int) -> None:
+    def __init__(self, array: NDArray[Any], held_nbytes: int, orientation: int = UPRIGHT) -> None:
         self.shape, self.dtype, self.held_nbytes = array.shape, array.dtype, held_nbytes
+        self.orientation = orientation
         self._array = array
 
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
@@ -99,86 +109,73 @@ class _Array:
 
 
 class _Mapped:
-    row_step, piece_nbytes, held_nbytes = 1, 0, 0
+    row_step, piece_nbytes, held_nbytes, orientation = 1, 0, 0, UPRIGHT
 
     def __init__(self, name: str, path: Path) -> None:
         self._path = path
-        array = self._open()
+        array = read_npy(path)
         self.shape, self.dtype = _checked(name, array.shape, array.dtype)
 
-    def _open(self) -> NDArray[Any]:
-        try:
-            return np.asarray(np.load(self._path, mmap_mode="r", allow_pickle=False))
-        except FileNotFoundError as error:
-            raise FileError(f"no such file: {str(self._path)!r}") from error
-        except OSError as error:
-            raise FileError(f"cannot read {str(self._path)!r}: {error.strerror or error}") from error
-        except (ValueError, EOFError) as error:
-            raise FileError(f"{str(self._path)!r} is not a readable npy file") from error
-
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
-        window = self._open()[y0:y1, x0:x1]
-        return np.array(window.reshape(*window.shape[:2], *self.shape[2:]), self.dtype, order="C")
+        with parsing(self._path, "npy file"):  # it may have changed
+            window = read_npy(self._path)[y0:y1, x0:x1]
+            return np.array(window.reshape(y1 - y0, x1 - x0, *self.shape[2:]), self.dtype, order="C")
+
+
+def _tiled(name: str, path: Path) -> Any:
+    """Return the page of a TIFF that can be read tile by tile, None if it must be read whole."""
+    try:
+        import tifffile
+    except ModuleNotFoundError as error:
+        raise StereokitError(
+            f"{name}: windows of TIFF need tifffile, which is not installed: pip install 'stereokit[large]'"
+        ) from error
+    with parsing(path, "TIFF"), tifffile.TiffFile(path) as file:
+        page = open_tiff(path, file)
+        return page
 
 
 class _Tiff:
     held_nbytes = 0
 
-    def __init__(self, name: str, path: Path) -> None:
-        try:
-            import tifffile
-        except ModuleNotFoundError as error:
-            raise StereokitError(
-                f"{name}: windows of TIFF need tifffile, which is not installed: pip install 'stereokit[large]'"
-            ) from error
-        self._path = path
-        try:
-            with tifffile.TiffFile(path) as file:
-                self._page: Any = file.pages.first
-                page = self._page
-                layout = str(getattr(page.photometric, "name", page.photometric))
-                plain = page.planarconfig == 1 or page.samplesperpixel == 1
-                if not plain or layout == "PALETTE" or page.samplesperpixel not in (1, 3, 4) or page.imagedepth != 1:
-                    raise FileError(
-                        f"{str(path)!r} must be a grey or RGB TIFF with its channels side by side, got "
-                        f"{page.samplesperpixel} channels, {layout}"
-                    )
-                if page.dtype is None:
-                    raise FileError(f"{str(path)!r} holds pixels of no type that can be matched")
-                tile = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
-        except FileNotFoundError as error:
-            raise FileError(f"no such file: {str(path)!r}") from error
-        except OSError as error:
-            raise FileError(f"cannot read {str(path)!r}: {error.strerror or error}") from error
-        except tifffile.TiffFileError as error:
-            raise FileError(f"{str(path)!r} is not a readable TIFF: {error}") from error
-        color = (3,) if page.samplesperpixel > 1 else ()
-        height, width = page.imagelength, page.imagewidth
+    def __init__(self, name: str, path: Path, page: Any) -> None:
+        self._path, self._page = path, page
+        with parsing(path, "TIFF"):
+            tile = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
+            height, width = page.imagelength, page.imagewidth
+            self._stored = height, width
+            self._tile = min(int(tile[0]), height), int(tile[1])
+            if min(*self._tile, height, width) < 1:
+                raise FileError(f"{str(path)!r} is a broken TIFF: {width}x{height} in pieces of {tile[1]}x{tile[0]}")
+            tag = page.tags.valueof(_ORIENTATION, default=UPRIGHT)
+            self.orientation = tag if tag in range(1, 9) else UPRIGHT
+            if self.orientation > 4:  # on its side
+                height, width = width, height
+            color = (3,) if page.samplesperpixel > 1 else ()
         self.shape, self.dtype = _checked(name, (height, width, *color), page.dtype)
-        self._tile = min(tile[0], height) if not page.is_tiled else tile[0], tile[1]
-        self.row_step = self._tile[0]
+        self.row_step = self._tile[0] if self.orientation <= 4 else self._tile[1]
         pixels = self._tile[0] * self._tile[1] * page.samplesperpixel
         self.piece_nbytes = 3 * pixels * self.dtype.itemsize  # as stored, decoded, and on its way to the window
 
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
+        height, width = self.shape[:2]
+        place = stored_window(self.orientation, height, width, y0, y1, x0, x1)
+        with parsing(self._path, "TIFF"):
+            return oriented(self._read(*place), self.orientation)
+
+    def _read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
         out = np.zeros((y1 - y0, x1 - x0, *self.shape[2:]), self.dtype)
         page, (high, wide) = self._page, self._tile
-        across = -(-self.shape[1] // wide)
-        try:
-            with self._path.open("rb") as file:
-                for down in range(y0 // high, -(-y1 // high)):
-                    for along in range(x0 // wide, -(-x1 // wide)):
-                        index = down * across + along
-                        file.seek(page.dataoffsets[index])
-                        stored = file.read(page.databytecounts[index])
-                        decoded = page.decode(stored, index, jpegtables=page.jpegtables)[0] if stored else None
-                        if decoded is not None:  # None is a tile that was never written: zeros
-                            self._place(decoded[0], down * high, along * wide, out, y0, x0)
-        except (OSError, IndexError) as error:
-            raise FileError(f"cannot read {str(self._path)!r}: {error}") from error
-        except Exception as error:  # whatever a decoder raises for broken data, or for want of its package
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise FileError(f"{str(self._path)!r} cannot be decoded: {reason}") from error
+        across = -(-self._stored[1] // wide)
+        with self._path.open("rb") as file:
+            for down in range(y0 // high, -(-y1 // high)):
+                for along in range(x0 // wide, -(-x1 // wide)):
+                    index = down * across + along
+                    file.seek(page.dataoffsets[index])
+                    stored = file.read(page.databytecounts[index])
+                    decoded = page.decode(stored, index, jpegtables=page.jpegtables)[0] if stored else None
+                    if decoded is not None:  # None is a tile that was never written: zeros
+                        self._place(decoded[0], down * high, along * wide, out, y0, x0)
         return out
 
     def _place(self, tile: NDArray[Any], top: int, start: int, out: NDArray[Any], y0: int, x0: int) -> None:

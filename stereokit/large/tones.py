@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import Tone, find_tone
-from stereokit.images.resize import half_size, smooth
+from stereokit.images.resize import reduced, smooth
 from stereokit.large.sources import Source
 
 __all__ = ["BLOCK_NBYTES", "Ranges", "find_ranges", "read_pair", "tone_of"]
@@ -65,29 +65,28 @@ def read_pair(
     return GrayPair(images[0], images[1], masks[0], masks[1], images[0] if guide is None else guide, ranges, tone.span)
 
 
-def find_ranges(left: Source, right: Source, tone: Tone, halved: bool, sigma: float, threads: int) -> Ranges:
+def find_ranges(left: Source, right: Source, tone: Tone, part: int, sigma: float, threads: int) -> Ranges:
     """Return the smallest and the largest value of either image as a cost sees it: in grey, halved, smoothed.
 
     Parameters
     ----------
     left, right : Source
     tone : Tone
-    halved : bool
-        Whether matching is at half size.
+    part : {1, 2, 4}
+        Matching is at one over this of the size.
     sigma : float
         Standard deviation of the smoothing, pixels.
     threads : int
         Threads to use.
     """
     height, width = left.shape[:2]
-    step = max(2, BLOCK_NBYTES // (8 * width) * 2)
-    margin = 2 * (int(4 * sigma) + 2)  # OpenCV's Gaussian ends at four sigma
+    step = max(4, BLOCK_NBYTES // (16 * width) * 4)
+    margin = max(2, part) * (int(4 * sigma) + 2)  # OpenCV's Gaussian ends at four sigma
     found: tuple[list[int], list[int]] = ([], [])
     for top in range(0, height, step):
         y0, y1 = max(top - margin, 0), min(top + step + margin, height)
         pair = read_pair(left, right, tone, (y0, y1, 0, width))
-        pair = smooth(half_size(pair) if halved else pair, sigma, threads=threads)
-        part = 2 if halved else 1
+        pair = smooth(reduced(pair, part), sigma, threads=threads)
         kept = slice((top - y0) // part, -(-(min(top + step, height) - y0) // part))
         for values, image in zip(found, (pair.left, pair.right), strict=True):
             values += [int(image[kept].min()), int(image[kept].max())]

@@ -47,7 +47,7 @@ def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: i
         If the map is not (H, W) numbers, or `threads` is none.
     """
     if not isinstance(mode, str) or mode not in FILLS:
-        raise UnknownNameError(did_you_mean("fill", str(mode), FILLS))
+        raise UnknownNameError(did_you_mean("fill", mode, FILLS))
     threads = check_threads(threads)
     out = checked_map(disparity)
     nearest = mode == "nearest"

@@ -13,8 +13,9 @@ from collections import Counter
 import cv2
 import numpy as np
 import pytest
-from batches import images, inodes, refused, run, start, wait_for, write_pairs
+from batches import APP, SMALL, images, inodes, refused, run, start, wait_for, write_pairs
 from limits import HANG_S
+from typer.testing import CliRunner
 
 import stereokit
 from stereokit.errors import FileError
@@ -100,7 +101,7 @@ def test_a_list_in_its_forms(tmp_path):
         (b"a.png,b.png,../out\n", "name must be a file name"),
         (b"a.png,b.png,/etc/x\n", "name must be a file name"),
         (b"a.png,b.png,.hidden\n", "name must be a file name"),
-        (b"\xff\xfe\x00", "not UTF-8"),
+        (b"\xff\xfe\x00", "not in UTF-8"),
         (b"\n# nothing\n", "no pairs"),
         (b"", "no pairs"),
     ],
@@ -257,11 +258,11 @@ def test_a_full_disk_ends_the_run_and_keeps_what_is_there(tmp_path, monkeypatch)
     write_pairs(tmp_path, [f"{k:02d}" for k in range(20)])
     real, calls = batch_job.write_disparity, []
 
-    def write(path, disparity):
+    def write(path, disparity, **options):
         calls.append(path)
         if len(calls) > 3:
             raise FileError("cannot write: No space left on device") from OSError(errno.ENOSPC, "full")
-        real(path, disparity)
+        real(path, disparity, **options)
 
     monkeypatch.setattr(batch_job, "write_disparity", write)
     line = refused(tmp_path, "-o", tmp_path / "out", "--workers", "1")
@@ -416,3 +417,136 @@ def test_the_function_takes_any_engine(tmp_path):
     )
     assert isinstance(summary, Summary) and seen == [1, 2, 3]
     assert (summary.written, summary.failed, summary.errors) == (2, 1, [("b", "broken")])
+
+
+# Names
+
+
+def listed(folder, *files):
+    """Make empty files and return the pairs of the folder, by name."""
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    pairs = folder_pairs(folder)
+    return {p.name: tuple(os.path.relpath(side, folder) for side in (p.left, p.right)) for p in pairs}
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (("left01.png", "right01.png", "left02.png", "right02.png"), ["01", "02"]),
+        (("01L.png", "01R.png", "12l.jpg", "12r.jpg"), ["01", "12"]),
+        (("a_left_01.png", "a_right_01.png"), ["a_01"]),
+        (("frameLeft7.png", "frameRight7.png"), ["frame_7"]),
+        (("imgL.png", "imgR.png"), ["img"]),
+        (("x_cam0.png", "x_cam1.png", "y_cam0.png", "y_cam1.png"), ["x", "y"]),
+        (("a_left.webp", "a_right.webp", "b_left.npy", "b_right.npy"), ["a", "b"]),
+        (("Left/1.png", "Right/1.png"), ["1"]),
+        (("LEFT/a_left.png", "RIGHT/a_right.png"), ["a"]),
+        (("left/01L.png", "right/01R.png"), ["01"]),
+        (("cam0/1.png", "cam1/1.png"), ["1"]),
+        (("mav0/cam0/data/1.png", "mav0/cam1/data/1.png", "mav0/cam0/sensor.yaml"), ["1"]),
+        (("image_00/data/1.png", "image_01/data/1.png"), ["1"]),
+        (("Motorcycle/im0.png", "Motorcycle/im1.png", "2006/Aloe/view1.png", "2006/Aloe/view5.png", "x/notes.txt"),
+         ["2006/Aloe", "Motorcycle"]),
+        (("venus/im0.ppm", "venus/im1.ppm", "venus/im2.ppm", "venus/im6.ppm"), ["venus"]),
+        (("one/left.png", "one/right.png"), ["one"]),
+        (("12:30:05_left.png", "12:30:05_right.png"), ["12:30:05"]),
+        (("left/0.png", "right/0.png", "left/0.npy", "right/0.npy"), ["0"]),
+    ],
+)  # fmt: skip
+def test_names_of_pairs(files, names, tmp_path):
+    found = listed(tmp_path, *files)
+    assert sorted(found) == names
+    assert sorted(side for pair in found.values() for side in pair) == sorted(f for f in files if "." in f and
+           not f.endswith((".txt", ".yaml")) and not (f.endswith(".npy") and "/" in f)
+           and not ("venus" in f and f[-5] in "01"))  # fmt: skip
+    if "venus/im2.ppm" in files:
+        assert found["venus"] == ("venus/im2.ppm", "venus/im6.ppm")
+
+
+def test_a_view_that_is_missing_is_told_where_the_name_is_sure(tmp_path):
+    found = listed(tmp_path, "a_left.png", "a_right.png", "b_left.png", "r2.png")
+    assert sorted(found) == ["a", "b"] and os.path.basename(found["b"][1]) == "b_right.png"
+
+
+def test_a_folder_without_pairs_says_what_is_known_and_how_to_tell_more(tmp_path):
+    (tmp_path / "x1.png").touch()
+    line = refused(tmp_path, "-o", tmp_path / "out")
+    assert "--pattern" in line and "NAME_left and NAME_right" in line and "im0 and im1" in line
+    assert list(listed(tmp_path / "scene", "im0.png", "im1.png")) == ["scene"]
+
+
+def test_a_list_may_have_further_columns_that_are_files(tmp_path):
+    for text, names in (
+        ("i2/0.png i3/0.png disp/0.png\n", ["0"]),
+        ("a.png,b.png,name,disp.pfm\nc.png,d.png,disp_occ/1.png,disp_noc/1.png\n", ["name", "c"]),
+        ("\ufeffa.png\tb.png\tdisp.tiff\r\nc.png\td.png\r\n", ["a", "c"]),
+    ):
+        (tmp_path / "list.txt").write_bytes(text.encode())
+        assert [pair.name for pair in list_pairs(tmp_path / "list.txt")] == names
+    (tmp_path / "list.txt").write_text('"' + "l" * 200_000 + '",r.png\n')
+    with pytest.raises(FileError, match=r"list\.txt"):
+        list_pairs(tmp_path / "list.txt")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file systems elsewhere do not have these names")
+def test_any_name_of_the_file_system_will_do(tmp_path):
+    names = ["12:30:05", 'a"b', "what?", "back\\slash", "two\nlines", os.fsdecode(b"caf\xe9"), "[x]", " ", "<|>"]
+    folder = tmp_path / os.fsdecode(b"\xe9t\xe9")
+    write_pairs(folder, names)
+    (folder / "left" / "what?.png").write_bytes(b"broken")
+    out = tmp_path / os.fsdecode(b"caf\xe9 [red]")
+    summary = run(folder, "-o", out, "--color", status=1)
+    assert (summary["written"], summary["failed"]) == (len(names) - 1, 1)
+    assert summary["errors"][0]["name"] == "what?"
+    for name in names:
+        assert (out / f"{name}.png").exists() == (out / "color" / f"{name}.png").exists() == (name != "what?")
+    assert json.loads((out / "summary.json").read_bytes()) == summary
+    assert run(folder, "-o", out, "--color", status=1)["found"] == len(names) - 1
+
+
+def test_a_name_that_cannot_be_costs_its_own_pair(tmp_path):
+    for name in ("a_l.png", "a_r.png", ".._l.png", "_l.png", "_r.png"):
+        write_image(tmp_path / f"x{name}", images(0)[0 if "l" in name else 1])
+    summary = run(tmp_path, "-o", tmp_path / "out", "--pattern", "x*_l.png", "x*_r.png", status=1)
+    assert (summary["written"], summary["failed"]) == (1, 2)
+    assert all("cannot be that of a file" in error["reason"] for error in summary["errors"])
+
+
+def test_what_looks_wrong_about_pairs_is_told(tmp_path, capfd):
+    write_pairs(tmp_path, ["good", "same"], (48, 160))
+    left, right = images(0, (48, 160))
+    write_image(tmp_path / "right" / "same.png", images(1, (48, 160))[0])
+    summary = run(tmp_path, "-o", tmp_path / "out")
+    assert [(entry["name"], entry["reason"][:30]) for entry in summary["warnings"]] == [
+        ("same", "left and right hold the same p")
+    ]
+    by_name = {entry["name"]: entry["density"] for entry in summary["density"]["lowest"]}
+    assert by_name["good"] == stereokit.Matcher("S2", max_disparity=16)(left, right).density
+    assert list(by_name) == sorted(by_name, key=by_name.get)
+    assert summary["density"]["mean"] == pytest.approx(sum(by_name.values()) / 2)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a folder that is in use cannot be removed on Windows")
+@pytest.mark.parametrize("again", [False, True])
+def test_a_folder_that_vanishes_is_noticed_and_not_made_anew(again, tmp_path, monkeypatch):
+    write_pairs(tmp_path, [f"{k:02d}" for k in range(12)])
+    out = tmp_path / "out"
+    real, calls = batch_job.write_disparity, []
+
+    def write(path, disparity, **options):
+        real(path, disparity, **options)
+        calls.append(path)
+        if len(calls) == 3:
+            os.rename(out, tmp_path / "elsewhere")
+            if again:
+                out.mkdir()
+
+    monkeypatch.setattr(batch_job, "write_disparity", write)
+    done = CliRunner().invoke(APP, [str(tmp_path), "-o", str(out), *SMALL, "--color", "--workers", "1"])
+    assert done.exit_code == 1
+    assert "was removed or replaced while the batch ran" in done.output
+    assert len(calls) < 8  # it ends there
+    assert out.exists() == again
+    assert not (out / "summary.json").exists() and not (out / "manifest.json").exists()

@@ -13,6 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from stereokit.errors import FileError, InputError, OptionError, StereokitError, UnknownNameError
+from stereokit.io import write_disparity
 from stereokit_evaluation.commands.evaluate import evaluate, run
 from stereokit_evaluation.data import datasets
 from stereokit_evaluation.data.frame import Frame
@@ -361,3 +362,80 @@ def test_frames_that_a_refiner_was_trained_on_are_told_of():
     assert seen_in_training(matcher, "elsewhere", frames) is None
     assert seen_in_training(SimpleNamespace(refine=None), "set", frames) is None
     assert seen_in_training(object(), "set", frames) is None
+
+
+def test_refiners_have_a_row_each(kitti, tmp_path, fake):
+    words = (
+        "--dataset",
+        "kitti2015",
+        "--root",
+        kitti,
+        "--scale",
+        "0.5",
+        "--refiner",
+        "linear",
+        "--refiner",
+        "stereokit",
+    )
+    out, maps = tmp_path / "out.json", tmp_path / "maps"
+    done = command(*words, "--method", "S4", "--method", "other", "--json", out, "--error-maps", maps)
+    assert done.exit_code == 0, done.output
+    rows = [(row["method"], row["refiner"]) for row in read(out)["results"]]
+    assert rows == [(method, refiner) for method in ("zncc+sgm", "other") for refiner in ("linear", "stereokit")]
+    assert [made["refiner"] for made in fake.made] == ["linear", "stereokit"] * 2
+    assert sorted(path.name for path in maps.iterdir()) == sorted(f"{m}-{r}" for m, r in rows)
+    table = command(*words, "--method", "S4").stdout
+    assert "zncc+sgm linear x0.5" in table and "zncc+sgm stereokit x0.5" in table
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pfm", ".npy", ".tiff", ".tif"])
+def test_every_format_that_is_written_is_found(suffix, tmp_path, fake):
+    for side in ("left", "right"):
+        png(tmp_path / side / "a.png", np.full((*SHAPE, 3), 50, np.uint8))
+    for folder in ("disparity", "mine"):
+        (tmp_path / folder).mkdir()
+        write_disparity(tmp_path / folder / f"a{suffix}", np.full(SHAPE, 10, np.float32))
+    words = ("--dataset", "folder", "--root", tmp_path, "--json", tmp_path / "out.json")
+    for more in ((), ("--predictions", tmp_path / "mine")):
+        done = command(*words, *more)
+        assert done.exit_code == 0, done.output
+        assert read(tmp_path / "out.json")["results"][0]["d1"]["occ"]["all"] == 0
+
+
+def test_a_hostile_frame_costs_itself_and_any_name_can_be_shown(tmp_path, fake):
+    names = ["good", "image[red]", "[bold]map", "npy", "header", "size"]
+    for name in names:
+        for side in ("left", "right"):
+            png(tmp_path / side / f"{name}.png", np.full((*SHAPE, 3), 50, np.uint8))
+        (tmp_path / "disparity").mkdir(exist_ok=True)
+        write_disparity(tmp_path / "disparity" / f"{name}.pfm", np.full(SHAPE, 10, np.float32))
+    (tmp_path / "left" / "image[red].png").write_bytes(b"nothing")
+    (tmp_path / "disparity" / "[bold]map.pfm").write_bytes(b"Pf\n" + b"1" * 5000 + b" 1\n-1\n")
+    (tmp_path / "disparity" / "npy.pfm").unlink()
+    (tmp_path / "disparity" / "npy.npy").write_bytes(b"\x93NUMPY\x01\x00\x04\x00{}\n ")
+    (tmp_path / "disparity" / "header.pfm").unlink()
+    (tmp_path / "disparity" / "header.tif").write_bytes(b"II*\0\x08\0\0\0")
+    write_disparity(tmp_path / "disparity" / "size.pfm", np.full((3, 3), 10, np.float32))
+    done = command("--dataset", "folder", "--root", tmp_path, "--json", tmp_path / "out.json")
+    assert done.exit_code == 1, done.output
+    document = read(tmp_path / "out.json")
+    assert document["results"][0]["images"] == 1
+    assert sorted(skip["frame"] for skip in document["skipped"]) == sorted(set(names) - {"good"})
+    assert all(f"skipped {name}: " in done.output for name in set(names) - {"good"})
+    for frames in ("9" * 5000, f"0-{'9' * 5000}"):
+        wrong = command("--dataset", "folder", "--root", tmp_path, "--frames", frames)
+        assert isinstance(wrong.exception, OptionError) and "frames must be" in str(wrong.exception)
+
+
+def test_what_looks_wrong_about_a_frame_is_told(tmp_path):
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(128, 90, (60, 420)), (0, 0), 0.8)
+    left, right = (np.clip(noise[:, start : start + 400], 0, 255).astype(np.uint8) for start in (0, 12))
+    (tmp_path / "disparity").mkdir()
+    for name, other in (("good", right), ("rows", np.roll(right, 9, axis=0)), ("same", left)):
+        png(tmp_path / "left" / f"{name}.png", left)
+        png(tmp_path / "right" / f"{name}.png", other)
+        write_disparity(tmp_path / "disparity" / f"{name}.pfm", np.full(left.shape, 12, np.float32))
+    done = command("--dataset", "folder", "--root", tmp_path, "--method", "S2", "--max-disparity", "128")
+    assert done.exit_code == 0, done.output
+    lines = [line for line in done.output.splitlines() if line.startswith("warning: ")]
+    assert len(lines) == 2 and "rows: only " in lines[0] and "same: left and right hold the same pixels" in lines[1]

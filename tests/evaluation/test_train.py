@@ -105,6 +105,7 @@ def test_the_folder_and_the_report(root, tmp_path, trainable):
     content = weights_of(out)
     assert (content.network, content.form) == ("cnn", "residual")
     assert content.notes["settings"]["steps"] == 4
+    assert content.disparities == (0, content.notes["disparities"][1]) and content.notes["disparities"][1] > 0
     assert "Y" not in content.ranges and len(content.ranges["FE_1"]) == 32
     assert (out / "weights.safetensors").stat().st_size < 1_000_000
     rows = list(csv.reader((out / "curves.csv").read_text().splitlines()))

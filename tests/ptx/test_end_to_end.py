@@ -187,7 +187,8 @@ def test_images_of_the_device_at_half_size(host_as_device, refiner):
 @pytest.mark.parametrize("low", [5, -7])
 def test_nothing_lies_below_an_odd_minimum_at_half_size(host_as_device, low):
     pytest.importorskip("torch")
-    pair = _pair(9, 27)
+    left, _ = _pair(9, 27)
+    pair = left, np.roll(left, 1 - low, axis=1)  # a pixel below
     options = {"min_disparity": low, "max_disparity": low + 16, "scale": 0.5, "right": True}
     want = Matcher("S2", device="cpu", **options)(*pair)
     matcher = Matcher("S2", device="cuda", **options)

@@ -12,7 +12,7 @@ from stereokit import Disparity
 from stereokit_refiners.weights import NETWORKS, WeightFile, write
 
 NAN = np.nan
-NAMES = tuple(NETWORKS)
+NAMES = tuple(name for name, network in NETWORKS.items() if "disparity" in network.inputs)
 LEARNED = [name for name in ("openvino", "onnxruntime", "torch") if importlib.util.find_spec(name)]
 needs_backend = pytest.mark.skipif(
     not LEARNED or not importlib.util.find_spec("safetensors"), reason="needs a runtime for networks, and safetensors"

@@ -123,7 +123,7 @@ def test_unknown_options_are_refused_with_the_known_ones(path):
         matcher(backend="torch")  # linear has none
     with pytest.raises(OptionError, match="backend"):
         matcher(refiner=LearnedRefiner(path), backend="torch")  # an object has its own
-    with pytest.raises(OptionError, match=r"^refiner needs scale=0\.5"):
+    with pytest.raises(OptionError, match=r"^refiner '.*' needs scale=0\.5, got scale=1"):
         matcher(refiner=path, scale=1)
 
 

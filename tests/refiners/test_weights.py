@@ -113,6 +113,10 @@ def test_loading_never_runs_code(tmp_path):
         ({"ranges": '{"FE_1": 2.5}'}, ["ranges and notes as JSON"]),
         ({"ranges": '{"FE_1": ["wide"]}'}, ["ranges and notes as JSON"]),
         ({"notes": "7"}, ["ranges and notes as JSON"]),
+        ({"notes": '{"disparities": 128}'}, ["disparities", "two numbers", "128"]),
+        ({"notes": '{"disparities": [64, 0]}'}, ["disparities", "[64, 0]"]),
+        ({"notes": '{"disparities": [0, "far"]}'}, ["disparities", "far"]),
+        ({"notes": '{"disparities": [0, NaN]}'}, ["disparities", "nan"]),
     ],
 )
 def test_wrong_metadata(tmp_path, metadata, parts):
@@ -209,7 +213,7 @@ def test_without_safetensors_the_extra_is_named(monkeypatch, tmp_path):
 
 
 def test_architectures_by_name():
-    assert list(NETWORKS) == ["stereovae", "cnn", "stereokit"]
+    assert list(NETWORKS) == ["stereovae", "cnn", "stereokit", "evidence"]
     assert network_named("cnn") is NETWORKS["cnn"]
     with pytest.raises(FileError, match=r"^no network named 'stereovea'; did you mean 'stereovae'\?"):
         network_named("stereovea")

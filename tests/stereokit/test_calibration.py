@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereokit.calibration import Calibration, read_calibration
-from stereokit.errors import FileError, InputError, OptionError
+from stereokit.errors import FileError, InputError, OptionError, StereokitWarning
 
 DATA = Path(os.environ.get("STEREOKIT_DATA", Path(__file__).parents[3] / "shared" / "data"))
 NAN = np.nan
@@ -159,7 +159,7 @@ def test_json(tmp_path):
         ("cam0=[1 0 1; 0 1 1; 0 0 1]\nbaseline=3\n", "no field 'doffs'"),
         (MIDDLEBURY.replace("999.421 0 294.182", "999.421 0"), "cam0 must hold 9 numbers, got 8"),
         (MIDDLEBURY.replace("193.001", "wide"), "baseline must hold 1 numbers, got 'wide'"),
-        (MIDDLEBURY.replace("741", "inf"), "infinity"),
+        (MIDDLEBURY.replace("741", "inf"), "width must hold finite numbers"),
         (MIDDLEBURY.replace("193.001", "-1"), "baseline_m must be positive"),
         (KITTI.replace("P_rect_03", "P_rect_04"), "no field 'P_rect_03'"),
         ("P0: 1 2 3\n", "no field 'P2'"),
@@ -204,3 +204,109 @@ def test_real_calibration():
     )
     assert near == pytest.approx(1.9727, abs=1e-3)
     assert far == pytest.approx(4.849, abs=1e-3)
+
+
+LEFT, RIGHT = "cam0=[700 0 200; 0 700 80; 0 0 1]\n", "cam1=[700 0 240; 0 700 80; 0 0 1]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LEFT + RIGHT + "doffs=-40\nbaseline=120\n", "doffs is -40, but cam0 and cam1 say 40"),
+        (LEFT + RIGHT + "doffs=40.6\nbaseline=120\n", "doffs is 40.6"),
+        (LEFT + RIGHT.replace("700", "701") + "baseline=120\n", "share fx, .* got 700 and 701"),
+        (LEFT + RIGHT.replace("0 700 80", "0 690 80") + "baseline=120\n", "share fy, .* got 700 and 690"),
+        (LEFT + RIGHT.replace("80", "80.7") + "baseline=120\n", "cam0 and cam1 must share cy, .* 80 and 80.7"),
+        (LEFT.replace("700 0 200", "700 12 200") + RIGHT + "baseline=120\n", "cam0 .* skew of 12"),
+        (LEFT + RIGHT.replace("700 0 240", "700 12 240") + "baseline=120\n", "cam1 .* skew of 12"),
+        (LEFT.replace("0 0 1", "0 0 0") + RIGHT + "baseline=120\n", "cam0 must be a camera matrix"),
+        (LEFT.replace("[700", "[0") + "doffs=0\nbaseline=120\n", "cam0 must begin with a positive focal length"),
+        ("P2: 700 0 200 0 0 700 80 0 0 0 1 0\nP3: 640 0 200 -77 0 700 80 0 0 0 1 0\n", "P2 and P3 must share fx"),
+        ("P2: 700 0 200 0 0 700 80 0 0 0 1 0\nP3: 700 0 200 -77 0 640 80 0 0 0 1 0\n", "P2 and P3 must share fy"),
+        ("P2: 700 0 200 0 0 700 80 0 0 0 1 0\nP3: 700 0 200 -77 0 700 95 0 0 0 1 0\n", "P2 and P3 must share cy"),
+        ("P2: 700 0 200 0 0 700 80 0 0 0 1 0\nP3: 700 9 200 -77 0 700 80 0 0 0 1 0\n", "P3 .* skew of 9"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(tmp_path, text, message):
+    path = tmp_path / "calib.txt"
+    path.write_text(text)
+    with pytest.raises(FileError, match=message) as caught:
+        read_calibration(path)
+    assert "calib.txt" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_what_differs_by_rounding_is_taken(tmp_path):
+    path = tmp_path / "calib.txt"
+    path.write_text(LEFT + RIGHT.replace("700 0", "700.3 0.2").replace("80", "80.4") + "doffs=40.3\nbaseline=120\n")
+    found = read_calibration(path)
+    assert (found.fx, found.cy, found.doffs) == (700, 80, pytest.approx(40.3))
+
+
+@pytest.mark.parametrize("change", [lambda b: b"\xef\xbb\xbf" + b, lambda b: b.replace(b"\n", b"\r\n")])
+def test_files_of_windows_are_read_like_others(tmp_path, change):
+    path = tmp_path / "calib.txt"
+    for text in (MIDDLEBURY, KITTI, '{"fx": 100, "fy": 50, "cx0": 2,\n "cy": 1, "baseline_m": 0.5, "width": 640.0}\n'):
+        path.write_text(text)
+        plain = read_calibration(path)
+        path.write_bytes(change(text.encode()))
+        assert read_calibration(path) == plain
+    assert plain.width == 640 and isinstance(plain.width, int)
+
+
+def test_sizes_may_be_whole_numbers_of_any_type():
+    sizes = Calibration(1, 1, 0, 0, 1, width=np.int64(4), height=3.0)
+    assert (sizes.width, sizes.height) == (4, 3) and isinstance(sizes.width, int)
+    for bad in (640.5, True, 0, float("nan"), 10**400):
+        with pytest.raises(OptionError, match="width must be a positive whole number"):
+            Calibration(1, 1, 0, 0, 1, width=bad)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("%YAML:1.0\n---\nP2: !!opencv-matrix\n   rows: 3\n", r"OpenCV calibration \(YAML\)"),
+        ('<?xml version="1.0"?>\n<opencv_storage>\n<M1></M1>\n', r"OpenCV calibration \(XML\)"),
+        ('{"M1": {"type_id": "opencv-matrix", "rows": 3}}', r"OpenCV calibration \(JSON\)"),
+        ("image_width: 400\ncamera_name: right\nprojection_matrix:\n  rows: 3\n", "ROS camera_info"),
+        ("cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0, 0]\n", "Kalibr"),
+        ("[LEFT_CAM_HD]\nfx=700\n[STEREO]\nBaseline=120\n", "ZED"),
+        ('{"extrinsic": {"baseline": 0.2}, "intrinsic": {"fx": 2262}}', "Cityscapes"),
+        ("700 0 200 0 700 80 0 0 1\n0.12\n", "bare numbers"),
+    ],
+)
+def test_files_of_others_are_called_by_their_names(tmp_path, text, words):
+    path = tmp_path / "calib.txt"
+    path.write_text(text)
+    with pytest.raises(FileError, match=f"looks like .*{words}.*; known are Middlebury.*KITTI.*JSON with fx"):
+        read_calibration(path)
+
+
+def test_odd_figures_are_warned_of(tmp_path):
+    path = tmp_path / "calibration.json"
+    fields = {"fx": 700, "fy": 700, "cx0": 200, "cy": 80, "baseline_m": 0.12}
+    for change, words in (
+        ({"baseline_m": 120}, "a baseline of 120 m"),
+        ({"baseline_m": 0.0005}, "a baseline of 0.0005 m"),
+        ({"width": 200}, "cx0 is 200 of 200 pixels"),
+        ({"cy": -3, "height": 160}, "cy is -3 of 160 pixels"),
+    ):
+        path.write_text(json.dumps({**fields, **change}))
+        with pytest.warns(StereokitWarning, match=words):
+            read_calibration(path)
+    path.write_text(json.dumps(fields))
+    with pytest.warns(StereokitWarning, match="principal point outside"):
+        read_calibration(path, size=(150, 160))
+    assert read_calibration(path, size=(400, 160)).fx == 700  # and no warning, which would be an error here
+    path.write_text(json.dumps({**fields, "width": 400}))
+    with pytest.raises(InputError, match="400x"):
+        read_calibration(path, size=(401, 160))
+
+
+@pytest.mark.data
+def test_real_calibrations_do_not_contradict_themselves():
+    paths = [*DATA.glob("middlebury/2014/*/calib.txt"), *DATA.glob("eth3d/two_view_training/*/calib.txt")]
+    paths += [*DATA.glob("kitti201*/**/calib*/*.txt")]
+    if not paths:
+        pytest.skip(f"no real pairs in {DATA}; set STEREOKIT_DATA")
+    for path in paths:
+        assert read_calibration(path).baseline_m > 0.01

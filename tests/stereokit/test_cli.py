@@ -15,9 +15,10 @@ import pytest
 from typer.testing import CliRunner
 
 from stereokit import io
-from stereokit.cli import app
+from stereokit.cli import app, output
 from stereokit.cli.output import waiting
 from stereokit.errors import OptionError
+from stereokit.notices import warn
 from stereokit.result import Disparity
 
 HEIGHT, WIDTH = 6, 8
@@ -381,3 +382,82 @@ def test_importing_the_command_line_is_light():
     package = str(Path(app.__file__).parents[1])
     done = subprocess.run([sys.executable, "-c", code, package], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_paths_are_told_as_they_are(tmp_path, pair):
+    for name in ("map[left].pfm", "a[/red].pfm", "[bold]x.pfm"):
+        (tmp_path / "a[").mkdir(exist_ok=True)
+        result = run("match", *pair, "-o", tmp_path / "a[" / name)
+        assert result.exit_code == 0, result.output
+        assert name in "".join(result.stdout.replace("│", "").split())  # the table may break it
+        assert (tmp_path / "a[" / name).exists()
+    result = run("match", tmp_path / "no[/red].png", pair[1], "-o", tmp_path / "d.pfm")
+    assert "no[/red].png" in error_of(result)
+
+
+def test_tables_hold_words_as_they_are(capsys):
+    table = output.Table("a [b]", "c", title="[/t]")
+    table.add_row("[/x]\n\udce9", "[red]y")
+    output.report({}, [table], None)
+    shown = capsys.readouterr().out
+    for words in ("a [b]", "[/t]", "[/x] \\udce9", "[red]y"):
+        assert words in shown
+
+
+def test_a_warning_is_one_line_and_the_work_goes_on(tmp_path, pair, monkeypatch):
+    real = FakeMatcher.__call__
+
+    def doubtful(self, left, right):
+        warn("only 3 % of\nit")
+        return real(self, left, right)
+
+    monkeypatch.setattr(FakeMatcher, "__call__", doubtful)
+    result = run("match", *pair, "-o", tmp_path / "d.pfm")
+    assert result.exit_code == 0
+    assert result.stderr == "warning: only 3 % of it\n"  # the call that compiles says nothing
+
+
+def test_a_map_whose_range_was_checked_is_written(tmp_path, pair, monkeypatch):
+    def beyond(self, left, right):  # as a refiner may
+        disparity = np.full((HEIGHT, WIDTH), 256.3, np.float32)
+        disparity[0] = -0.2
+        return Disparity(disparity, disparity > 0)
+
+    monkeypatch.setattr(FakeMatcher, "__call__", beyond)
+    assert run("match", *pair, "-o", tmp_path / "d.png", "--max-disparity", "256").exit_code == 0
+    assert io.read_disparity(tmp_path / "d.png").tolist()[0][0] == 1 / 256
+
+
+@pytest.mark.parametrize("factor", [1, 16, 4])
+def test_clouds_of_any_bit_depth_have_like_colours(tmp_path, factor):
+    image = np.random.default_rng(0).integers(0, 256, (HEIGHT * 5, WIDTH * 5, 3))
+    for side in ("left", "right"):
+        io.write_image(tmp_path / f"{side}.png", (image * factor).astype(np.uint8 if factor == 1 else np.uint16))
+    (tmp_path / "camera.json").write_text(json.dumps({**CALIBRATION, "cx0": 20, "cy": 15}))
+    words = ("--calibration", tmp_path / "camera.json", "--ply", tmp_path / "p.ply")
+    result = run("match", tmp_path / "left.png", tmp_path / "right.png", "-o", tmp_path / "d.pfm", *words)
+    assert result.exit_code == 0 and result.stderr == "", result.output
+    data = (tmp_path / "p.ply").read_bytes()
+    start = data.index(b"end_header\n") + 11
+    colors = np.frombuffer(data, [("x", "<f4", 3), ("c", "u1", 3)], offset=start)["c"]
+    assert np.abs(colors.astype(int) - image[:, 1:].reshape(-1, 3)).max() <= 4
+
+
+def test_a_picture_of_negative_disparities_has_colours(tmp_path, pair, monkeypatch):
+    def negative(self, left, right):
+        disparity = np.linspace(-60, -1, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
+        return Disparity(disparity, np.ones(disparity.shape, bool))
+
+    monkeypatch.setattr(FakeMatcher, "__call__", negative)
+    words = ("--min-disparity", "-64", "--max-disparity", "0", "--color", tmp_path / "c.png")
+    assert run("match", *pair, "-o", tmp_path / "d.pfm", *words).exit_code == 0
+    assert len(np.unique(io.read_image(tmp_path / "c.png").reshape(-1, 3), axis=0)) > 40
+
+
+def test_a_calibration_with_odd_figures_is_warned_of(tmp_path, pair):
+    (tmp_path / "camera.json").write_text(json.dumps({**CALIBRATION, "cx0": 50, "baseline_m": 120}))
+    words = ("--calibration", tmp_path / "camera.json", "--ply", tmp_path / "p.ply")
+    result = run("match", *pair, "-o", tmp_path / "d.pfm", *words)
+    assert result.exit_code == 0
+    lines = result.stderr.splitlines()
+    assert len(lines) == 2 and "120 m" in lines[0] and "cx0 is 50 of 8 pixels" in lines[1]

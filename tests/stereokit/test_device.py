@@ -74,7 +74,7 @@ def test_cuda_without_a_driver_says_what_to_do(no_driver):
     assert isinstance(caught.value, OptionError) and isinstance(caught.value, StereokitError)
 
 
-def test_auto_falls_back_in_silence(no_driver, recwarn, capsys):
+def test_auto_is_the_cpu_in_silence(no_driver, recwarn, capsys):
     matcher = Matcher("S2", device="auto", max_disparity=8)
     assert matcher.device == "cpu"
     assert not recwarn.list and capsys.readouterr() == ("", "")
@@ -101,6 +101,16 @@ def test_a_gpu_is_described(with_driver, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     assert driver.has_device()
     assert driver.describe() == "Emulated 9000, compute capability 8.7"
+
+
+def test_auto_is_the_cpu_also_where_there_is_a_gpu(with_driver, monkeypatch):
+    with_driver(1)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    assert driver.has_device()
+    matcher = Matcher("S2", max_disparity=8)  # "auto" is the default
+    assert matcher.device == "cpu"
+    with pytest.raises(DeviceError, match="device must be 'cuda' for images on the device"):
+        matcher.on_device(None, None)
 
 
 @pytest.mark.parametrize("wrong", ["gpu", None, 0, "CUDA"])

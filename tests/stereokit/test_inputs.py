@@ -283,7 +283,7 @@ BAD_OPTIONS = [
     ({"max_disparity": None}, ["max_disparity", "None"]),
     ({"max_disparity": 2049}, ["max_disparity", "2048", "2049"]),
     ({"min_disparity": 0.5}, ["min_disparity", "0.5"]),
-    ({"scale": 2}, ["scale", "1 or 0.5", "2"]),
+    ({"scale": 2}, ["scale", "1, 0.5 or 0.25", "2"]),
     ({"scale": None}, ["scale", "None"]),
     ({"scale": "half"}, ["scale", "half"]),
     ({"device": "tpu"}, ["device", "cpu", "tpu"]),

@@ -252,7 +252,7 @@ def warned(call):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         call()
-    return [str(one.message) for one in caught if issubclass(one.category, StereokitWarning)]
+    return [str(one.message) for one in caught if one.category is StereokitWarning]
 
 
 def test_a_pair_that_has_lost_its_levels_is_warned_of():

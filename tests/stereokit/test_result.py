@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from stereokit import io
 from stereokit.calibration import Calibration
 from stereokit.errors import FileError, InputError, OptionError
 from stereokit.io import read_disparity
-from stereokit.result import Disparity, colorize
+from stereokit.result import Disparity, color_range, colorize
 
 NAN = np.nan
 MAP = np.array([[10, 20, NAN], [40, 5, 1]], np.float32)
@@ -103,3 +104,58 @@ def test_inputs_stay_as_they_are():
     kept = strided.copy()
     colorize(strided)
     np.testing.assert_array_equal(strided, kept)
+
+
+def test_numpy_takes_a_result_as_its_map():
+    disparity = np.array([[1.5, np.nan], [40.25, 3]], np.float32)
+    result = Disparity(disparity, np.isfinite(disparity))
+    assert np.asarray(result) is disparity
+    np.testing.assert_array_equal(np.array(result), disparity)
+    assert not np.shares_memory(np.array(result), disparity)
+    assert np.asarray(result, np.float64).dtype == np.float64
+    assert np.nanmax(result) == 40.25
+    np.testing.assert_array_equal(np.stack([result, result])[1], disparity)
+    if np.lib.NumpyVersion(np.__version__) >= "2.0.0":
+        assert np.asarray(result, copy=False) is disparity
+        with pytest.raises(ValueError, match="without a copy"):
+            np.asarray(result, dtype=np.float64, copy=False)
+    assert result.__array__(np.float32, copy=False) is disparity
+    assert not np.shares_memory(result.__array__(copy=True), disparity)
+
+
+def test_a_result_is_told_in_one_line():
+    disparity = np.array([[1.5, np.nan], [40.25, 3]], np.float32)
+    result = Disparity(disparity, np.isfinite(disparity), confidence=np.zeros((2, 2), np.float32))
+    assert repr(result) == "Disparity(2x2, 1.5 .. 40.2 px, 75.0 % measured, confidence)"
+    nothing = Disparity(np.full((1, 3), np.nan, np.float32), np.zeros((1, 3), bool))
+    assert repr(nothing) == "Disparity(1x3, no disparity, 0.0 % measured)"
+
+
+def test_the_automatic_range_holds_negative_and_far_disparities():
+    spread = np.linspace(0, 127, 4000, dtype=np.float32).reshape(40, 100)
+    for low in (-64, -200, 512, 3000):
+        values = spread + low
+        colors = colorize(values)
+        assert len(np.unique(colors.reshape(-1, 3), axis=0)) > 200
+        assert color_range(values) == pytest.approx((low + 1.27, low + 125.73), abs=0.1)
+    assert color_range(spread) == (0, pytest.approx(125.73, abs=0.1))  # as ever: 0 is dark blue
+    assert color_range(np.full((2, 2), NAN, np.float32)) == (0, 1)
+    assert color_range(np.full((2, 2), 7, np.float32)) == (0, 7)
+    assert color_range(np.full((2, 2), -7, np.float32)) == (-7, -6)
+
+
+@pytest.mark.parametrize("value", [300.5, 256.0, -0.25])
+def test_a_png_refuses_what_it_cannot_say(tmp_path, value):
+    values = np.array([[1, value, NAN]], np.float32)
+    result = Disparity(values, np.isfinite(values))
+    for write in (result.save, lambda path, **options: io.write_disparity(path, values, **options)):
+        with pytest.raises(InputError, match=r"255\.996 px .* clip=True"):
+            write(tmp_path / "a.png")
+        assert not any(tmp_path.iterdir())
+        write(tmp_path / "a.png", clip=True)
+        end = 65535 / 256 if value > 0 else 1 / 256
+        np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.png"), np.float32([[1, end, NAN]]))
+        (tmp_path / "a.png").unlink()
+        write(tmp_path / "a.pfm")
+        np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.pfm"), values)
+        (tmp_path / "a.pfm").unlink()

@@ -13,13 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, StereokitError
-from stereokit.io import read_image, write_disparity, write_image
+from stereokit.errors import InputError, StereokitError, one_line
+from stereokit.io import read_pair, write_disparity, write_image
 from stereokit.matching import Matcher
+from stereokit.notices import collecting
 from stereokit.result import colorize
-from stereokit_evaluation.batch.store import COLOR, publish, target_of
+from stereokit_evaluation.batch.store import COLOR, make_below, publish, target_of
 
 __all__ = ["Job", "Outcome", "describe", "matcher_of", "work"]
 
@@ -65,6 +67,10 @@ class Outcome:
         Nothing more can be written.
     seconds : float
         From reading to writing.
+    density : float or None
+        The share of pixels that were measured, from 0 to 1; None if nothing was matched.
+    doubts : tuple of str
+        What looks wrong about the pair, a line each.
     """
 
     name: str
@@ -72,6 +78,8 @@ class Outcome:
     reason: str = ""
     fatal: bool = False
     seconds: float = 0.0
+    density: float | None = None
+    doubts: tuple[str, ...] = ()
 
 
 def work(job: Job, name: str, left: str | NDArray[Any], right: str | NDArray[Any]) -> Outcome:
@@ -90,18 +98,23 @@ def work(job: Job, name: str, left: str | NDArray[Any], right: str | NDArray[Any
         target = target_of(folder, name, job.suffix)
         if target.exists():  # a worker that died had got that far
             return Outcome(name)
-        images = [read_image(image) if isinstance(image, str) else image for image in (left, right)]
-        if images[0].shape[:2] != images[1].shape[:2]:
-            sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
-            raise InputError(f"left and right must have the same size, got {sizes}")
-        matcher = matcher_of(job)
-        disparity = matcher(*images).disparity
+        with collecting() as doubts:
+            if isinstance(left, str) and isinstance(right, str):
+                left, right = read_pair(left, right)
+            images = np.asarray(left), np.asarray(right)
+            if images[0].shape[:2] != images[1].shape[:2]:
+                sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
+                raise InputError(f"left and right must have the same size, got {sizes}")
+            matcher = matcher_of(job)
+            result = matcher(*images)
         if job.color:  # first: the map says that all is done
             picture = folder / COLOR / f"{name}.png"
-            picture.parent.mkdir(parents=True, exist_ok=True)
-            write_image(picture, colorize(disparity, matcher.min_disparity, matcher.max_disparity))
-        written = publish(folder, target, lambda path: write_disparity(path, disparity))
-        return Outcome(name, written, seconds=time.perf_counter() - start)
+            make_below(folder, *picture.parent.relative_to(folder).parts)
+            write_image(picture, colorize(result.disparity, matcher.min_disparity, matcher.max_disparity))
+        # The range fits the format, as the command checks; a refiner may add a pixel.
+        written = publish(folder, target, lambda path: write_disparity(path, result.disparity, clip=True))
+        seconds = time.perf_counter() - start
+        return Outcome(name, written, seconds=seconds, density=result.density, doubts=tuple(doubts))
     except Exception as error:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, OSError):
@@ -112,7 +125,7 @@ def work(job: Job, name: str, left: str | NDArray[Any], right: str | NDArray[Any
 
 def describe(error: BaseException) -> str:
     """Return an error in one line, with its type unless it is one of ours."""
-    text = " ".join(str(error).split())
+    text = one_line(str(error))
     return text if isinstance(error, StereokitError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
 
 

@@ -4,14 +4,22 @@ A folder, the first rule that finds anything:
 
 1. ``--pattern LEFT RIGHT``, such as ``'*_cam0.png' '*_cam1.png'``: what the star stands for is the name.
 2. Two folders in it, files paired by name without suffix: ``left`` and ``right``; ``image_2`` and ``image_3``,
-   ``image_0`` and ``image_1``, ``colored_0`` and ``colored_1`` (KITTI, also below ``training`` or ``testing``);
-   ``image_02/data`` and ``image_03/data`` (KITTI raw). Or the two folders themselves, as two inputs.
-3. Files in it: ``NAME_left`` and ``NAME_right``, ``NAME_l`` and ``NAME_r``, ``left_NAME`` and ``right_NAME``; a ``-``
-   or a ``.`` will do for the ``_``, and any case.
+   ``image_0`` and ``image_1``, ``colored_0`` and ``colored_1`` (KITTI); ``image_02`` and ``image_03``, ``image_00`` and
+   ``image_01`` (KITTI raw), ``cam0`` and ``cam1`` (EuRoC), themselves or the folders ``data`` in them; all of them also
+   below ``training``, ``testing`` or ``mav0``, in any case. Or the two folders themselves, as two inputs. Where no name
+   is in both, what says the side is taken off: ``left/a_left.png`` and ``right/a_right.png`` are ``a``.
+3. Files in it whose names differ in what says the side: ``left`` and ``right``, ``l`` and ``r``, ``cam0`` and ``cam1``,
+   in any case, at the start, at the end or between ``-``, ``_``, ``.`` and blanks, or beside digits (``left01``,
+   ``01L``).
+4. Folders in it, at any depth, that hold one pair each, or the folder itself: ``im0`` and ``im1`` (Middlebury 2014,
+   ETH3D), ``im2`` and ``im6``, ``view1`` and ``view5``, ``left`` and ``right``. The folder's name is the pair's.
 
 A list, ``.csv``, ``.tsv`` or ``.txt``: ``left,right`` or ``left,right,name`` on each line, in UTF-8; without commas,
 tabs or blanks divide. Paths are relative to the list; the name is the left file's without suffix where none is given.
-Empty lines, lines that begin with ``#`` and a first line ``left,right`` count for nothing.
+Further columns that are files, such as the true disparity, count for nothing; nor do empty lines, lines that begin with
+``#`` and a first line ``left,right``.
+
+A name may be whatever the file system has. One that cannot be that of an output costs its own pair only.
 """
 
 from __future__ import annotations
@@ -19,37 +27,56 @@ from __future__ import annotations
 import csv
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from stereokit.errors import FileError, OptionError
-from stereokit.io import IMAGE_SUFFIXES
+from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES, READABLE_SUFFIXES, parsing, read_text
 
 __all__ = ["LIST_SUFFIXES", "Pair", "folder_pairs", "folders_pairs", "list_pairs"]
 
 LIST_SUFFIXES = (".csv", ".tsv", ".txt")
-_FOLDERS = (
+_SIDE_FOLDERS = (
     ("left", "right"),
-    *((f"{top}image_{a}", f"{top}image_{b}") for top in ("", "training/", "testing/") for a, b in ((2, 3), (0, 1))),
-    *((f"{top}colored_0", f"{top}colored_1") for top in ("", "training/", "testing/")),
-    ("image_02/data", "image_03/data"),
+    *((f"image_{a}", f"image_{b}") for a, b in ((2, 3), (0, 1))),
+    ("colored_0", "colored_1"),
+    *((f"image_{a}", f"image_{b}") for a, b in (("02", "03"), ("00", "01"))),
+    ("cam0", "cam1"),
 )
-_PART = r"""[^./\x00-\x1f\\:*?"<>|][^/\x00-\x1f\\:*?"<>|]*"""
-_NAME = re.compile(f"{_PART}(?:/{_PART})*")
-_SIDES = (
-    re.compile(r"(?P<name>.*)[-_.](?P<side>left|right|l|r)", re.IGNORECASE),
-    re.compile(r"(?P<side>left|right)[-_.](?P<name>.*)", re.IGNORECASE),
+_ABOVE = ("training", "testing", "mav0")
+_SCENE_FILES = (("im2", "im6"), ("im0", "im1"), ("view1", "view5"), ("left", "right"))
+_SURE = (
+    re.compile(r"(?P<name>.*)[-_.](?:(?P<left>left|l)|(?P<right>right|r))", re.IGNORECASE | re.DOTALL),
+    re.compile(r"(?:(?P<left>left)|(?P<right>right))[-_.](?P<name>.*)", re.IGNORECASE | re.DOTALL),
 )
+"""Whole names without suffix; where one view of these is missing, that is worth telling."""
+_LIKELY = (
+    re.compile(
+        r"[-_. ]?(?<![a-z])(?:(?P<left>left|l|cam0(?!\d))|(?P<right>right|r|cam1(?!\d)))(?![a-z])[-_. ]?", re.IGNORECASE
+    ),
+    re.compile(r"(?<=[a-z])(?:(?P<left>Left|L)|(?P<right>Right|R))(?![a-z])[-_. ]?"),
+)
+"""Parts of names, of which both views must be there."""
+_FILES = frozenset((*READABLE_SUFFIXES, *DISPARITY_SUFFIXES))
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One pair: a name, which no other pair has, and two files, which may turn out not to be there."""
+    """One pair: a name, which no other pair has, and two files, which may turn out not to be there.
+
+    Attributes
+    ----------
+    name : str
+    left, right : str or None
+    reason : str
+        Why there is no file, where there is none.
+    """
 
     name: str
-    left: str
-    right: str
+    left: str | None
+    right: str | None
+    reason: str = ""
 
 
 def folder_pairs(folder: Path, pattern: tuple[str, str] | None = None) -> list[Pair]:
@@ -69,28 +96,31 @@ def folder_pairs(folder: Path, pattern: tuple[str, str] | None = None) -> list[P
         If a pattern has no star, or more than one.
     """
     if pattern is not None:
-        starred = [re.compile(".*".join(map(re.escape, _halves(part))).replace(".*", "(.*)")) for part in pattern]
+        starred = [re.compile("(.*)".join(map(re.escape, _halves(part))), re.DOTALL) for part in pattern]
         files = _files(folder)
         sides = [_named(folder, ((m[1], f) for f in files if (m := star.fullmatch(f)))) for star in starred]
         return _joined(sides, pattern, f"files {pattern[0]!r} and {pattern[1]!r} in {str(folder)!r}")
-    for left, right in _FOLDERS:
-        if (folder / left).is_dir() and (folder / right).is_dir():
-            return folders_pairs(folder / left, folder / right)
-    found: dict[str, list[tuple[str, str]]] = {"l": [], "r": []}
-    for file in _files(folder):
-        stem, suffix = os.path.splitext(file)
-        if suffix.lower() in IMAGE_SUFFIXES and (
-            match := next(filter(None, (s.fullmatch(stem) for s in _SIDES)), None)
-        ):
-            found[match["side"][0].lower()].append((match["name"], file))
-    sides = [_named(folder, found[side]) for side in "lr"]
-    rule = "left and right, image_2 and image_3, or files NAME_left and NAME_right"
-    return _joined(sides, ("{}_left.png", "{}_right.png"), f"pairs in {str(folder)!r}: it has neither folders {rule}")
+    for left, right in _side_folders(folder):
+        return folders_pairs(left, right)
+    sides = _by_side(folder, _files(folder))
+    if sides[0] or sides[1]:
+        return _joined(sides, ("{}_left.png", "{}_right.png"), "pairs")
+    scenes = list(_scenes(folder))
+    if scenes:
+        return scenes
+    raise FileError(
+        f"no pairs in {str(folder)!r}: it has neither folders left and right, image_2 and image_3 or cam0 and cam1, "
+        "nor files NAME_left and NAME_right, nor folders with im0 and im1; "
+        "other names can be told with --pattern, such as --pattern '*_a.png' '*_b.png'"
+    )
 
 
 def folders_pairs(left: Path, right: Path) -> list[Pair]:
     """Return the pairs of a folder of left and a folder of right images, sorted by name; see `folder_pairs`."""
     sides = [_stems(folder) for folder in (left, right)]
+    if not sides[0].keys() & sides[1].keys():
+        bare = [_by_side(folder, _files(folder), k)[k] for k, folder in enumerate((left, right))]
+        sides = bare if bare[0].keys() & bare[1].keys() else sides
     missing = f"{left}{os.sep}{{}}.png", f"{right}{os.sep}{{}}.png"
     return _joined(sides, missing, f"images in {str(left)!r} and {str(right)!r}")
 
@@ -103,12 +133,7 @@ def list_pairs(path: Path) -> list[Pair]:
     FileError
         If it cannot be read, a line is not what it should be, or two lines have one name.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise FileError(f"{str(path)!r} is not UTF-8 text") from error
-    except OSError as error:
-        raise FileError(f"cannot read {str(path)!r}: {error.strerror or error}") from error
+    lines = read_text(path, "list").split("\n")
     base = os.path.dirname(os.path.abspath(path))
     pairs: list[Pair] = []
     seen: dict[str, int] = {}
@@ -117,11 +142,14 @@ def list_pairs(path: Path) -> list[Pair]:
         text = line.strip()
         if not text or text.startswith("#"):
             continue
-        cells = [cell.strip() for cell in _cells(text)]
+        with parsing(path, "list"):
+            cells = [cell.strip() for cell in _cells(text)]
         if first and [cell.lower() for cell in cells] in (["left", "right"], ["left", "right", "name"]):
             first = False
             continue
         first = False
+        while len(cells) > 2 and _is_file(cells[-1]):  # the true disparity, say
+            cells.pop()
         if len(cells) not in (2, 3) or not all(cells):
             raise FileError(f"{str(path)!r} line {number} must be left,right or left,right,name, got {text!r}")
         name = cells[2] if len(cells) == 3 else os.path.splitext(os.path.basename(cells[0]))[0]
@@ -147,7 +175,15 @@ def _cells(text: str) -> Sequence[str]:
 
 
 def _bad_name(name: str) -> bool:
-    return _NAME.fullmatch(name) is None
+    return "\0" in name or any(not part or part.startswith(".") for part in name.split("/"))
+
+
+def _is_file(cell: str) -> bool:
+    return os.path.splitext(cell)[1].lower() in _FILES
+
+
+def _is_image(file: str) -> bool:
+    return os.path.splitext(file)[1].lower() in READABLE_SUFFIXES
 
 
 def _halves(pattern: str) -> list[str]:
@@ -158,26 +194,83 @@ def _halves(pattern: str) -> list[str]:
 
 
 def _files(folder: Path) -> list[str]:
-    try:
-        with os.scandir(folder) as entries:
-            return sorted(entry.name for entry in entries if not entry.name.startswith(".") and not entry.is_dir())
-    except OSError as error:
-        raise FileError(f"cannot read {str(folder)!r}: {error.strerror or error}") from error
+    return _entries(folder, folders=False)
+
+
+def _entries(folder: Path, folders: bool) -> list[str]:
+    with parsing(folder, "folder"), os.scandir(folder) as entries:
+        return sorted(e.name for e in entries if not e.name.startswith(".") and e.is_dir() == folders)
+
+
+def _side_folders(folder: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield the pairs of folders in a folder that are named after the sides, the surest first."""
+    top = _lowered(folder)
+    for place in (top, *(_lowered(top[name]) for name in _ABOVE if name in top)):
+        for names in _SIDE_FOLDERS:
+            if all(name in place for name in names):
+                left, right = (place[name] for name in names)
+                inside = left / "data", right / "data"
+                yield inside if all(map(Path.is_dir, inside)) else (left, right)
+
+
+def _lowered(folder: Path) -> dict[str, Path]:
+    """Return the folders in a folder by their names in lower case; one that is called just that goes first."""
+    names = _entries(folder, folders=True)
+    return {name.lower(): folder / name for name in sorted(names, key=str.islower)}
+
+
+def _scenes(folder: Path) -> Iterator[Pair]:
+    """Yield the pairs of all folders at and below a folder that hold one, named after the folders."""
+    for where, folders, files in os.walk(os.path.abspath(folder)):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        stems = {os.path.splitext(file)[0].lower(): file for file in sorted(files, reverse=True) if _is_image(file)}
+        for left, right in _SCENE_FILES:
+            if left in stems and right in stems:
+                inside = os.path.relpath(where, folder).replace(os.sep, "/")
+                name = os.path.basename(where) if inside == "." else inside
+                yield Pair(name, os.path.join(where, stems[left]), os.path.join(where, stems[right]))
+                break
+
+
+def _by_side(folder: Path, files: Iterable[str], only: int | None = None) -> list[dict[str, str]]:
+    """Return the images of a folder that say in their names which side they are of, by the rest of the name.
+
+    With `only`, 0 or 1, the folder holds the images of one side, and the other view is not looked for.
+    """
+    named: list[list[tuple[str, str]]] = [[], []]
+    sure: set[str] = set()
+    for file in filter(_is_image, files):
+        stem = os.path.splitext(file)[0]
+        match = next(filter(None, (pattern.fullmatch(stem) for pattern in _SURE)), None)
+        if match is not None:
+            name = match["name"]
+            sure.add(name)
+        else:
+            match = next((found[-1] for p in _LIKELY if (found := list(p.finditer(stem)))), None)
+            if match is None:
+                continue
+            name = "_".join(filter(None, (stem[: match.start()], stem[match.end() :])))
+        if name:
+            named[0 if match["left"] else 1].append((name, file))
+    left, right = (_named(folder, part) for part in named)
+    both = left.keys() & right.keys()
+    return [{n: f for n, f in side.items() if n in both or n in sure or only is not None} for side in (left, right)]
 
 
 def _stems(folder: Path) -> dict[str, str]:
-    split = ((os.path.splitext(file), file) for file in _files(folder))
-    return _named(folder, ((stem, file) for (stem, suffix), file in split if suffix.lower() in IMAGE_SUFFIXES))
+    return _named(folder, ((os.path.splitext(file)[0], file) for file in _files(folder) if _is_image(file)))
 
 
 def _named(folder: Path, files: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return files by name; of several of one name the one that is surely an image."""
     found: dict[str, str] = {}
     for name, file in files:
         if name in found:
             other = os.path.basename(found[name])
-            raise FileError(f"{str(folder)!r} has two images named {name!r}: {other!r} and {file!r}")
-        if _bad_name(name):
-            raise FileError(f"{str(folder)!r}: {file!r} gives the name {name!r}, which cannot be that of a file")
+            sure = [f for f in (other, file) if os.path.splitext(f)[1].lower() in IMAGE_SUFFIXES]
+            if len(sure) != 1:
+                raise FileError(f"{str(folder)!r} has two images named {name!r}: {other!r} and {file!r}")
+            file = sure[0]
         found[name] = os.path.join(os.path.abspath(folder), file)
     return found
 
@@ -191,4 +284,10 @@ def _joined(sides: Sequence[dict[str, str]], missing: tuple[str, str], what: str
     def path(k: int, name: str) -> str:
         return sides[k].get(name) or missing[k].replace("*", name).replace("{}", name)
 
-    return [Pair(name, path(0, name), path(1, name)) for name in sorted(left.keys() | right.keys())]
+    def pair(name: str) -> Pair:
+        if _bad_name(name):
+            file = os.path.basename(left.get(name) or right[name])
+            return Pair(file, None, None, f"{file!r} gives the name {name!r}, which cannot be that of a file")
+        return Pair(name, path(0, name), path(1, name))
+
+    return [pair(name) for name in sorted(left.keys() | right.keys())]

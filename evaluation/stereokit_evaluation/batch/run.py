@@ -18,13 +18,16 @@ import numpy as np
 import stereokit
 from stereokit.errors import StereokitError
 from stereokit.kernels.threads import available_threads
+from stereokit.notices import collecting
 from stereokit_evaluation.batch.job import Job, Outcome, matcher_of, work
 from stereokit_evaluation.batch.pairs import Pair
-from stereokit_evaluation.batch.store import finished, held
+from stereokit_evaluation.batch.store import finished, held, mark_of
 from stereokit_evaluation.batch.video import FramePair, Video
 from stereokit_evaluation.common.environment import versions
 
 __all__ = ["Engine", "Summary", "identity", "on_threads", "run_batch"]
+
+_LOWEST = 10
 
 Engine = Callable[[Job, Iterable[Pair | FramePair]], Generator[Outcome, None, None]]
 """Works on pairs and yields their outcomes, in any order."""
@@ -46,8 +49,14 @@ class Summary:
     interrupted : bool
     stopped : str
         Why the run could not go on; empty if it could.
+    vanished : bool
+        It could not because its folder is gone.
     notes : list of str
         Lines about the input.
+    doubts : list of (name, line)
+        What looks wrong about pairs.
+    lowest : list of (density, name)
+        The maps of this run of which least was measured, a few.
     """
 
     written: int = 0
@@ -57,7 +66,12 @@ class Summary:
     seconds: float = 0.0
     interrupted: bool = False
     stopped: str = ""
+    vanished: bool = False
     notes: list[str] = field(default_factory=list)
+    doubts: list[tuple[str, str]] = field(default_factory=list)
+    lowest: list[tuple[float, str]] = field(default_factory=list)
+    densities: float = 0.0
+    """Sum over the maps that this run made."""
 
     @property
     def pairs(self) -> int:
@@ -82,6 +96,11 @@ class Summary:
             "interrupted": self.interrupted,
             "stopped": self.stopped or None,
             "notes": self.notes,
+            "density": {
+                "mean": self.densities / self.written if self.lowest else None,
+                "lowest": [{"name": name, "density": density} for density, name in self.lowest],
+            },
+            "warnings": [{"name": name, "reason": line} for name, line in self.doubts],
             "versions": versions(),
         }
 
@@ -139,12 +158,17 @@ def run_batch(
     owned: Callable[[str], bool] = str.isdigit
     if not isinstance(source, Video):
         owned = {pair.name for pair in source}.__contains__
-    with held(Path(job.folder), identity(job, inputs), job.suffix, owned, overwrite) as there:
+    folder = Path(job.folder)
+    with held(folder, identity(job, inputs), job.suffix, owned, overwrite) as there:
+        mark = mark_of(folder)
         summary.found = len(there)
         start = time.perf_counter()
         outcomes = engine(job, _pending(source, there))
         try:
             for outcome in outcomes:
+                if mark_of(folder) != mark:
+                    summary.vanished = True
+                    break
                 _count(summary, outcome)
                 summary.seconds = time.perf_counter() - start
                 if progress is not None:
@@ -158,8 +182,11 @@ def run_batch(
             summary.stopped = str(error)
         finally:
             outcomes.close()
-        if summary.interrupted or summary.stopped:  # some were finished that nobody asked for any more
-            now = sum(map(owned, finished(Path(job.folder), job.suffix)))
+        summary.vanished = mark_of(folder) != mark
+        if summary.vanished:
+            summary.stopped = f"output {job.folder!r} was removed or replaced while the batch ran"
+        elif summary.interrupted or summary.stopped:  # some were finished that nobody asked for any more
+            now = sum(map(owned, finished(folder, job.suffix)))
             summary.written = max(summary.written, now - summary.found)
     summary.seconds = time.perf_counter() - start
     return summary
@@ -193,7 +220,8 @@ def on_threads(
 def _compile(job: Job) -> bool:
     """Match a small pair, so that threads do not compile side by side."""
     small = np.zeros((32, 32), np.uint8)
-    matcher_of(job)(small, small)
+    with collecting():
+        matcher_of(job)(small, small)
     return True
 
 
@@ -211,6 +239,10 @@ def _pending(source: list[Pair] | Video, there: set[str]) -> Iterator[Pair | Fra
 
 
 def _count(summary: Summary, outcome: Outcome) -> None:
+    summary.doubts += [(outcome.name, line) for line in outcome.doubts]
+    if outcome.written and outcome.density is not None:
+        summary.densities += outcome.density
+        summary.lowest = sorted([*summary.lowest, (outcome.density, outcome.name)])[:_LOWEST]
     if outcome.reason:
         summary.failed += 1
         summary.errors.append((outcome.name, outcome.reason))

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from stereokit.errors import FileError, OptionError
-from stereokit.io import write_bytes
+from stereokit.io import parsing, read_bytes, write_bytes
 from stereokit_evaluation.common.folders import check_folder, make_folder
 
-__all__ = ["COLOR", "finished", "held", "publish", "target_of", "write_document"]
+__all__ = ["COLOR", "finished", "held", "make_below", "mark_of", "publish", "target_of", "write_document"]
 
 COLOR = "color"
 """Folder of the coloured pictures."""
@@ -80,7 +80,7 @@ def held(
 
 def write_document(path: Path, content: dict[str, Any]) -> None:
     """Write what a person may want to read: JSON with names as they are."""
-    write_bytes(path, (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode())
+    write_bytes(path, (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace"))
 
 
 def finished(folder: Path, suffix: str) -> set[str]:
@@ -112,12 +112,11 @@ def publish(folder: Path, target: Path, write: Callable[[Path], object]) -> bool
     write : callable
         Writes the file at the path that it is given.
     """
-    partial = folder / _PARTIAL
-    partial.mkdir(exist_ok=True)
+    partial = make_below(folder, _PARTIAL)
     temporary = partial / (secrets.token_hex(8) + target.suffix)
     try:
         write(temporary)
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_below(folder, *target.parent.relative_to(folder).parts)
         try:
             os.link(temporary, target)
         except FileExistsError:
@@ -131,6 +130,29 @@ def publish(folder: Path, target: Path, write: Callable[[Path], object]) -> bool
         return True
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def make_below(folder: Path, *parts: str) -> Path:
+    """Make folders in the batch's folder and return the last, but not that folder: it may have been removed meanwhile.
+
+    Raises
+    ------
+    OSError
+        If one cannot be made.
+    """
+    for part in parts:
+        folder = folder / part
+        folder.mkdir(exist_ok=True)
+    return folder
+
+
+def mark_of(folder: Path) -> tuple[int, int] | None:
+    """Return what tells a folder from another that is put in its place, None if it is not there."""
+    try:
+        state = os.stat(folder)
+    except OSError:
+        return None
+    return state.st_dev, state.st_ino
 
 
 @contextmanager
@@ -155,15 +177,13 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    try:
-        content = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return None
-    except (OSError, ValueError) as error:
-        raise FileError(f"{str(path)!r} is not a manifest that can be read; use --overwrite") from error
-    if not isinstance(content, dict):
-        raise FileError(f"{str(path)!r} is not a manifest that can be read; use --overwrite")
-    return content
+    with parsing(path, "manifest", "manifest must be one of this program's; use --overwrite"):
+        content = json.loads(read_bytes(path))
+        if not isinstance(content, dict):
+            raise ValueError("it is no object")
+        return content
 
 
 def _check_same(folder: Path, previous: dict[str, Any] | None, made_with: dict[str, Any], names: set[str]) -> None:

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError
+from stereokit.io import parsing
+from stereokit.io.quiet import quiet_decoders
 
 __all__ = ["FramePair", "Video"]
 
@@ -73,7 +75,8 @@ class Video:
             number = 0
             while True:
                 name = f"{number:06d}"
-                there = [capture.grab() for capture in captures]
+                with quiet_decoders():
+                    there = [capture.grab() for capture in captures]
                 if not all(there):
                     if any(there):
                         side = "left" if not there[0] else "right"
@@ -93,7 +96,8 @@ _WIDTH, _HEIGHT = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
 def _open(path: Path) -> Any:
     if not path.exists():
         raise FileError(f"no such file: {str(path)!r}")
-    capture = cv2.VideoCapture(str(path))
+    with parsing(path, "video"), quiet_decoders():
+        capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise FileError(f"{str(path)!r} is neither a folder, a list (.csv, .tsv, .txt) nor a video that can be read")
     return capture
@@ -102,7 +106,8 @@ def _open(path: Path) -> Any:
 def _frame(name: str, captures: list[Any]) -> FramePair:
     images = []
     for capture in captures:
-        good, image = capture.retrieve()
+        with quiet_decoders():
+            good, image = capture.retrieve()
         if not good or image is None:
             return FramePair(name, None, None, "the frame cannot be decoded")
         images.append(np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image))

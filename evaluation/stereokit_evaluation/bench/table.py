@@ -14,8 +14,8 @@ from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
+from stereokit.cli.output import Table
 from stereokit.kernels.simd import vector_bits
 from stereokit.kernels.threads import available_threads
 from stereokit_evaluation.bench.peers import HH, PEERS, THREE_WAY, label, usable_levels

@@ -17,7 +17,6 @@ from typing import Annotated, Any
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from stereokit.cli.options import (
     DeviceOption,
@@ -34,9 +33,10 @@ from stereokit.cli.options import (
     parse_settings,
     write_json,
 )
-from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit.cli.output import Table
+from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
-from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES
+from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES
 from stereokit_evaluation.batch.job import Job, matcher_of
 from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
 from stereokit_evaluation.batch.run import Engine, Summary, identity, on_threads, run_batch
@@ -75,9 +75,10 @@ def batch(
 ) -> None:
     """Match all pairs of a folder, a list or a video; go on where an earlier run ended.
 
-    A folder has left and right, or image_2 and image_3, or files NAME_left and NAME_right; a list has lines
-    left,right[,name]; a video has both views side by side, or is two files. Maps that are there are not made again,
-    and must come from the same inputs and options. Pairs that fail are named, and the exit status is then 1.
+    A folder has left and right, or image_2 and image_3, or files NAME_left and NAME_right, or others by --pattern; a
+    list has lines left,right[,name]; a video has both views side by side, or is two files. Maps that are there are not
+    made again, and must come from the same inputs and options. Pairs that fail are named, and the exit status is then
+    1.
     """
     check_json(json_file)
     if file_format not in _FORMATS:
@@ -108,7 +109,7 @@ def batch(
     if isinstance(source, Video) and source.expected and summary.pairs < source.expected and not summary.interrupted:
         summary.notes.append(f"the video says {source.expected} frames, {summary.pairs} could be read")
     document = {**summary.as_json(), "output": where, **engine_options, "options": identity(job, origin)}
-    if Path(where).is_dir():
+    if Path(where).is_dir() and not summary.vanished:
         write_document(Path(where) / "summary.json", document)
     printed = write_json(json_file, document)
     _finish(summary, job, printed)
@@ -134,7 +135,9 @@ def find_pairs(inputs: Sequence[Path], pattern: tuple[str, str] | None = None) -
     for path in inputs:
         if not path.exists():
             raise FileError(f"no such file or folder: {str(path)!r}")
-        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:  # which OpenCV would take for a video of one frame
+        if (
+            path.is_file() and path.suffix.lower() in READABLE_SUFFIXES
+        ):  # which OpenCV would take for a video of one frame
             raise OptionError(
                 f"inputs must be folders, lists or videos, got the image {str(path)!r}; for one pair: match"
             )
@@ -179,31 +182,36 @@ def _engine(name: str, scheduler: str | None, workers: int | None) -> tuple[Engi
 def _run(
     job: Job, source: list[Pair] | Video, run_on: Engine, origin: list[str], overwrite: bool, total: int | None
 ) -> Summary:
-    seen = told = 0
+    seen = told = doubted = 0
     with progress(total) as (console, step):
 
+        def tell(line: str) -> None:
+            console.print(one_line(line), markup=False, highlight=False, soft_wrap=True)
+
         def show(summary: Summary) -> None:
-            nonlocal seen, told
-            while told < min(len(summary.errors), _SHOWN_ERRORS):
-                name, reason = summary.errors[told]
-                console.print(f"failed {name}: {reason}", markup=False, highlight=False, soft_wrap=True)
+            nonlocal seen, told, doubted
+            for name, reason in summary.errors[told:_SHOWN_ERRORS]:
+                tell(f"failed {name}: {reason}")
                 told += 1
+            for name, line in summary.doubts[doubted:_SHOWN_ERRORS]:
+                tell(f"warning: {name}: {line}")
+                doubted += 1
             rate = summary.pairs_per_second
             step("" if rate is None else f"{rate:.1f} pairs/s", summary.pairs - seen)
             seen = summary.pairs
 
         summary = run_batch(job, source, run_on, inputs=origin, overwrite=overwrite, progress=show)
-        if len(summary.errors) > told:
-            more = f"... and {len(summary.errors) - told} more, all in summary.json"
-            console.print(more, markup=False, highlight=False)
+        for what, count in (("failed", len(summary.errors) - told), ("doubtful", len(summary.doubts) - doubted)):
+            if count > 0:
+                tell(f"... and {count} more {what}, all in summary.json")
         if summary.interrupted:
-            console.print("interrupted: the same command goes on from here", highlight=False)
+            tell("interrupted: the same command goes on from here")
     return summary
 
 
 def _finish(summary: Summary, job: Job, printed: bool) -> None:
     for note in summary.notes:
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(f"note: {one_line(note)}", err=True)
     if not printed:
         table = Table(box=SIMPLE_HEAD, pad_edge=False)
         for head in ("method", "pairs", "written", "there before", "failed", "seconds", "pairs/s"):
@@ -213,8 +221,14 @@ def _finish(summary: Summary, job: Job, printed: bool) -> None:
         seconds = f"{summary.seconds:.1f}", "-" if rate is None else f"{rate:.2f}"
         table.add_row(matcher_of(job).method, *map(str, counts), *seconds)
         Console(width=None if sys.stdout.isatty() else 120).print(table)
+        if summary.lowest:
+            density, name = summary.lowest[0]
+            typer.echo(f"lowest density: {100 * density:.1f} % in {one_line(name)}")
     if summary.interrupted:
         raise typer.Exit(130)
+    if summary.vanished:
+        typer.echo(f"error: {one_line(summary.stopped)}", err=True)
+        raise typer.Exit(1)
     if summary.stopped:
         raise StereokitError(f"{summary.stopped}; {summary.written} maps were written")
     if summary.failed:

@@ -24,6 +24,7 @@ from stereokit.cli.options import JsonOption, check_json, write_json
 from stereokit.cuda.driver import describe
 from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
+from stereokit.images.intensity import display_8bit
 from stereokit.io import read_image
 from stereokit.large.memory import free_nbytes
 from stereokit.methods import parse_method
@@ -215,7 +216,7 @@ def _read(path: Path) -> Gray:
     image = read_image(path, gray=True)
     if image.dtype.kind == "f":
         raise InputError(f"images to time must be 8 or 16 bit, got {image.dtype} in {str(path)!r}")
-    return (image // 257).astype(np.uint8) if image.dtype == np.uint16 else image
+    return display_8bit(image)
 
 
 def _images(size: Size, pictures: tuple[Gray, Gray] | None) -> tuple[Gray, Gray]:

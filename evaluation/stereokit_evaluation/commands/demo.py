@@ -21,9 +21,10 @@ import typer
 from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
+from rich.text import Text
 
 from stereokit.cli.options import JsonOption, check_json, write_json
+from stereokit.cli.output import Table
 from stereokit.errors import InputError, OptionError, StereokitError
 from stereokit.io import write_image
 from stereokit.result import colorize
@@ -172,7 +173,7 @@ def demo(
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right))
     outcomes: list[_Outcome] = []
     for label, matcher in matchers.items():
-        with console.status(f"{label}: compiling, once"):
+        with console.status(Text(f"{label}: compiling, once")):
             found = matcher(left, right)
         times = []
         for _ in range(_RUNS):

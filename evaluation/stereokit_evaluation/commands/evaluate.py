@@ -16,11 +16,11 @@ import typer
 from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from stereokit import __version__
 from stereokit.cli.options import DeviceOption, JsonOption, check_json, parse_settings, write_json
-from stereokit.errors import OptionError
+from stereokit.cli.output import Table
+from stereokit.errors import OptionError, one_line
 from stereokit.io import write_image
 from stereokit_evaluation.common.folders import make_folder
 from stereokit_evaluation.common.progress import progress
@@ -59,6 +59,11 @@ class _Run:
     device: str | None = None
     matcher: Any = None
 
+    @property
+    def folder(self) -> str:
+        """The name of a folder for its pictures, which no other row has."""
+        return self.method if self.refiner is None else f"{self.method}-{Path(self.refiner).name}"
+
 
 def evaluate(
     dataset: Annotated[str, typer.Option(help="kitti2015, kitti2012, middlebury, eth3d, folder or scenes.")],
@@ -66,7 +71,7 @@ def evaluate(
     frames: Annotated[str | None, typer.Option(help="Numbers or names, such as 0-3,34-40.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,
     scale: Annotated[float, typer.Option(help="1, or 0.5 to match at half size.")] = 1.0,
-    refiner: Annotated[str | None, typer.Option(help="Refiner for the half-size map.")] = None,
+    refiner: Annotated[list[str] | None, typer.Option(help="Refiner for the half-size map; may repeat.")] = None,
     predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")] = None,
@@ -97,7 +102,11 @@ def evaluate(
             max_disparity = max(suggested, default=_DEFAULT_DISPARITIES)
         options = {"max_disparity": max_disparity, "threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
         methods = method or [_DEFAULT_METHOD]
-        runs = [_matcher_run(name, scale, refiner, device, options, color) for name in methods]
+        runs = [
+            _matcher_run(name, scale, refine, device, options, color)
+            for name in methods
+            for refine in (dict.fromkeys(refiner) if refiner else (None,))
+        ]
     seen = (seen_in_training(job.matcher, dataset, chosen) for job in runs)
     for line in dict.fromkeys(line for line in seen if line is not None):
         typer.echo(f"note: {line}", err=True)
@@ -132,22 +141,24 @@ def _matcher_run(
 def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -> tuple[list[Result], bool]:
     """Run all, printing skipped frames as they come; an interrupt ends the work and keeps what was done."""
     results: list[Result] = []
-    told: set[Skipped] = set()
+    told: set[str] = set()
     with progress(len(runs) * len(frames)) as (console, step):
         for job in runs:
             scored: list[Scored] = []
             skipped: list[Skipped] = []
-            draw = None if maps is None else _draws(maps / job.method)
+            draw = None if maps is None else _draws(maps / job.folder)
             try:
                 for outcome in score_frames(frames, job.estimate, draw):
                     if isinstance(outcome, Scored):
                         scored.append(outcome)
+                        lines = [f"warning: {outcome.name}: {line}" for line in outcome.doubts]
                     else:
                         skipped.append(outcome)
-                        if outcome not in told:
-                            line = f"skipped {outcome.name}: {outcome.reason}"
+                        lines = [f"skipped {outcome.name}: {outcome.reason}"]
+                    for line in map(one_line, lines):
+                        if line not in told:
                             console.print(line, markup=False, highlight=False, soft_wrap=True)
-                            told.add(outcome)
+                            told.add(line)
                     step(f"{job.method} {outcome.name}")
             except KeyboardInterrupt:
                 console.print("interrupted: the figures cover the frames done so far", highlight=False)

@@ -15,9 +15,9 @@ from typing import Annotated, Any
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from stereokit.cli.options import JsonOption, check_json, write_json
+from stereokit.cli.output import Table
 from stereokit_evaluation.training.run import run_training
 
 __all__ = ["train"]

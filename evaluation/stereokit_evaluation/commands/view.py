@@ -23,7 +23,7 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.errors import InputError, OptionError
-from stereokit.io import check_output, read_disparity, read_image, write_bytes
+from stereokit.io import check_output, read_disparity, read_pair, write_bytes
 from stereokit_evaluation.report import viewer
 from stereokit_evaluation.report.page import render, require
 from stereokit_evaluation.scoring.kitti import score
@@ -72,13 +72,12 @@ def view(
         for name in names
         for refine in refiners
     }
-    images = read_image(left), read_image(right)
+    images = read_pair(left, right)
     if images[0].shape != images[1].shape:
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
         raise InputError(f"LEFT and RIGHT must have the same size and number of channels, got {sizes}")
-    camera = None if calibration is None else read_calibration(calibration, cameras)
-    if camera is not None:
-        camera.check_size(images[0].shape[1], images[0].shape[0])
+    size = images[0].shape[1], images[0].shape[0]
+    camera = None if calibration is None else read_calibration(calibration, cameras, size)
     known = None if truth is None else read_disparity(truth)
     if known is not None and known.shape != images[0].shape[:2]:
         raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {known.shape}")

@@ -33,7 +33,7 @@ def progress(total: int | None) -> Iterator[tuple[Console, Callable[..., None]]]
         ``step(text, advance=1)`` says what was done.
     """
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not console.is_terminal)
     task = bar.add_task("", total=total)
     begun, shown = time.monotonic(), -math.inf

@@ -8,6 +8,7 @@ pixels.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from importlib import import_module
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from stereokit.calibration import Calibration, read_calibration
 from stereokit.errors import FileError, OptionError, UnknownNameError, did_you_mean
-from stereokit.io import read_disparity, read_image
+from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES, read_disparity, read_image, read_text
 from stereokit_evaluation.data.frame import Frame, Loader, select
 
 __all__ = [
@@ -39,8 +40,7 @@ _KITTI_DISPARITIES = 128  # the study's D; a few pixels of the ground truth lie 
 _LEVELS = {"2001": 8, "2003": 4, "2006": 3}  # levels a pixel in the 8-bit disparity maps
 _WIDEST = {"2001": 1000, "2003": 450, "2006": 480}  # a wider image is of a larger edition, with other levels
 _SCENE_SIZE = (640, 384)  # width, height
-_IMAGES = (".png", ".ppm", ".pgm", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-_MAPS = (".png", ".pfm", ".npy")
+_MAPS = (*DISPARITY_SUFFIXES, ".tif")
 
 
 def kitti2015(root: str | Path) -> list[Frame]:
@@ -101,11 +101,11 @@ def folder(root: str | Path) -> list[Frame]:
     """Return the pairs of a plain folder: ``left/NAME`` and ``right/NAME``, matched without extension.
 
     Ground truth, where there is any, lies in ``disp_noc`` and ``disp_occ``; ``disparity`` is another name of
-    the latter, and ``obj_map`` holds object maps. Disparities are 16-bit KITTI PNG, PFM or NPY.
+    the latter, and ``obj_map`` holds object maps. Disparities are 16-bit KITTI PNG, PFM, NPY or TIFF.
     """
     base = _root(root)
-    left, right = _stems(base / "left", _IMAGES), _stems(base / "right", _IMAGES)
-    noc, objects = _stems(base / "disp_noc", _MAPS), _stems(base / "obj_map", _IMAGES)
+    left, right = _stems(base / "left", READABLE_SUFFIXES), _stems(base / "right", READABLE_SUFFIXES)
+    noc, objects = _stems(base / "disp_noc", _MAPS), _stems(base / "obj_map", READABLE_SUFFIXES)
     occ = {**_stems(base / "disparity", _MAPS), **_stems(base / "disp_occ", _MAPS)}
     frames = [
         Frame(
@@ -118,7 +118,7 @@ def folder(root: str | Path) -> list[Frame]:
         )
         for name in left.keys() | right.keys() | noc.keys() | occ.keys()
     ]
-    return _found("plain", frames, base, "left/NAME.png, right/NAME.png, disparity/NAME.png (or .pfm, .npy)")
+    return _found("plain", frames, base, "left/NAME.png, right/NAME.png, disparity/NAME.png (or .pfm, .npy, .tiff)")
 
 
 def scenes(count: int = 20) -> list[Frame]:
@@ -285,12 +285,12 @@ def _masked(load_map: Loader, mask: Path) -> NDArray[np.float32]:
 def _ndisp(path: Path) -> int | None:
     """Return the number of disparities that a calibration file bounds, None if it does not say."""
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
+        lines = read_text(path, "calibration").splitlines()
+    except FileError:  # told where the calibration itself is asked for
         return None
     values = dict(line.strip().partition("=")[::2] for line in lines)
-    text = values.get("ndisp", "").strip()
-    return int(text) if text.isdecimal() and int(text) > 0 else None
+    text = re.fullmatch(r"\s*([1-9][0-9]{0,5})(?:\.0*)?\s*", values.get("ndisp", ""))
+    return int(text[1]) if text else None
 
 
 def _root(root: str | Path) -> Path:

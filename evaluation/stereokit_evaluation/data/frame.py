@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stereokit.calibration import Calibration
 from stereokit.errors import OptionError
-from stereokit.io import read_image
+from stereokit.io import read_image, read_pair
 
 __all__ = ["Frame", "Loader", "select"]
 
@@ -58,6 +58,12 @@ class Frame:
         """Return the right image, as `load_left`."""
         return _image(self.right, gray)
 
+    def load_pair(self, *, gray: bool = False) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return both images, as `load_left`; warn where the orientation tags of two files differ."""
+        if isinstance(self.left, Path) and isinstance(self.right, Path):
+            return read_pair(self.left, self.right, gray)
+        return self.load_left(gray=gray), self.load_right(gray=gray)
+
     def load_noc(self) -> NDArray[np.float32] | None:
         """Return the disparity of pixels that both cameras see, float32 (H, W), NaN unknown, or None."""
         return None if self.noc is None else self.noc()
@@ -92,7 +98,7 @@ def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:
     chosen: set[str] = set()
     for part in (text.strip() for text in which.split(",")):
         names = {f.name for f in everything if part and part in (f.name, f.name.rpartition("/")[2])}
-        if not names and (match := re.fullmatch(r"([0-9]+)(?:-([0-9]+))?", part)):
+        if not names and (match := re.fullmatch(r"([0-9]{1,18})(?:-([0-9]{1,18}))?", part)):
             first, last = int(match[1]), int(match[2] or match[1])
             if last < first:
                 raise OptionError(f"frames must be ranges with the smaller number first, got {part!r}")
@@ -105,7 +111,7 @@ def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:
 
 
 def _number(name: str) -> int | None:
-    match = re.search(r"([0-9]+)_1[01]$", name) or re.search(r"([0-9]+)$", name)
+    match = re.search(r"([0-9]{1,18})_1[01]$", name) or re.search(r"([0-9]{1,18})$", name)
     return int(match[1]) if match else None
 
 

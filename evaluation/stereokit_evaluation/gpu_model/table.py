@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from stereokit.cli.options import write_json
+from stereokit.cli.output import Table
 from stereokit.matching import Matcher
 from stereokit_evaluation.bench.peers import label
 from stereokit_evaluation.bench.table import new_table, versions

@@ -20,6 +20,7 @@ import numpy as np
 
 from stereokit.errors import StereokitError
 from stereokit.io import write_bytes
+from stereokit.notices import collecting
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL
 from stereokit_evaluation.data import published
 from stereokit_evaluation.data.frame import Frame
@@ -166,7 +167,8 @@ def _look(frame: Frame, rows: Sequence[Row]) -> dict[str, Any]:
     for row in rows:
         scored = next((one for one in row.result.frames if one.name == frame.name), None)
         if row.configuration.matcher is not None and scored is not None:
-            found = row.configuration.matcher(left, right)
+            with collecting():  # told when it was scored
+                found = row.configuration.matcher(left, right)
             disparity, valid = np.asarray(found.disparity), np.asarray(found.valid)
             maps.append(viewer.Shown(row.configuration.name, disparity, valid, _note(scored)))
     return viewer.pair(

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from stereokit.calibration import Calibration
 from stereokit.errors import InputError
-from stereokit.result import colorize
+from stereokit.images.intensity import display_8bit
+from stereokit.result import color_range, colorize
 from stereokit_evaluation.report.packing import pack_map, pack_mask
 from stereokit_evaluation.scoring.error_map import COLOURS, EDGES
 from stereokit_evaluation.scoring.kitti import D1_PIXELS, D1_SHARE, fill_background
@@ -95,13 +96,14 @@ def pair(
             raise InputError(f"{label} must have the size of the left image, {(height, width)}, got {array.shape}")
     truth = noc if occ is None else occ
     reference = maps[0].disparity if truth is None else truth
-    known = reference[np.isfinite(reference)]
+    bottom, top = color_range(reference)
     return {
         "name": name,
         "width": width,
         "height": height,
         "left": _jpeg(left),
-        "top": max(1.0, float(np.percentile(known, 99))) if known.size else 1.0,
+        "bottom": bottom,
+        "top": max(bottom + 1.0, top),
         "truth": None if truth is None else pack_map(truth),
         "seen": None if noc is None or occ is None else pack_mask(np.isfinite(noc)),
         "calibration": None if calibration is None else _geometry(calibration, width, height),
@@ -124,10 +126,8 @@ def _geometry(calibration: Calibration, width: int, height: int) -> dict[str, fl
 
 
 def _jpeg(image: NDArray[Any]) -> str:
-    """Return an image as a data URI; 16-bit and float ones are scaled to 8 bits by their range."""
-    if image.dtype != np.uint8:
-        top = 65535.0 if image.dtype == np.uint16 else max(float(np.nanmax(np.abs(image), initial=0.0)), 1e-9)
-        image = np.rint(np.clip(np.nan_to_num(image / top), 0, 1) * 255).astype(np.uint8)
+    """Return an image as a data URI."""
+    image = display_8bit(image)
     stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     done, data = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not done:

@@ -15,8 +15,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import FileError, InputError, StereokitError
-from stereokit.io import read_disparity
+from stereokit.errors import FileError, InputError, StereokitError, one_line
+from stereokit.io import DISPARITY_SUFFIXES, read_disparity
+from stereokit.notices import PairWarning, collecting, warn
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.kitti import Score, score
 
@@ -33,6 +34,9 @@ __all__ = [
     "seen_in_training",
     "with_matcher",
 ]
+
+
+_MAPS = (*DISPARITY_SUFFIXES, ".tif")
 
 
 class _Disparity(Protocol):
@@ -61,11 +65,12 @@ Observer = Callable[[Frame, Estimate, NDArray[np.float32] | None, NDArray[np.flo
 
 @dataclass(frozen=True)
 class Scored:
-    """One frame's counts, and the seconds that its matching took, if any was run."""
+    """One frame's counts, the seconds that its matching took, if any was run, and what looks wrong about it."""
 
     name: str
     score: Score
     seconds: float | None = None
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -133,6 +138,8 @@ def run(
     for done, outcome in enumerate(score_frames(every, with_matcher(matcher, gray=gray)), start=1):
         if isinstance(outcome, Scored):
             scored.append(outcome)
+            for line in outcome.doubts:
+                warn(f"{outcome.name}: {line}", PairWarning)
         else:
             skipped.append(outcome)
         if progress is not None:
@@ -157,17 +164,18 @@ def score_frames(
     """
     for frame in frames:
         try:
-            noc, occ, objects = frame.load_noc(), frame.load_occ(), frame.load_objects()
-            if noc is None and occ is None:
-                raise FileError("no ground truth found")
-            found = estimate(frame)
-            result = score(found.disparity, noc=noc, occ=occ, objects=objects, measured=found.measured)
+            with collecting() as doubts:
+                noc, occ, objects = frame.load_noc(), frame.load_occ(), frame.load_objects()
+                if noc is None and occ is None:
+                    raise FileError("no ground truth found")
+                found = estimate(frame)
+                result = score(found.disparity, noc=noc, occ=occ, objects=objects, measured=found.measured)
         except (StereokitError, OSError) as error:
-            yield Skipped(frame.name, " ".join(str(error).split()))
+            yield Skipped(frame.name, one_line(str(error)))
             continue
         if observe is not None:
             observe(frame, found, noc, occ)
-        yield Scored(frame.name, result, found.seconds)
+        yield Scored(frame.name, result, found.seconds, tuple(doubts))
 
 
 def seen_in_training(matcher: object, dataset: str, frames: Iterable[Frame]) -> str | None:
@@ -197,11 +205,12 @@ def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:
 
     def estimate(frame: Frame) -> Estimate:
         nonlocal warm
-        left, right = frame.load_left(gray=gray), frame.load_right(gray=gray)
+        left, right = frame.load_pair(gray=gray)
         if left.shape != right.shape:
             raise InputError(f"left and right must have one size, got {left.shape} and {right.shape}")
         if not warm:
-            matcher(left, right)
+            with collecting():
+                matcher(left, right)
             warm = True
         start = time.perf_counter()
         found = matcher(left, right)
@@ -212,7 +221,7 @@ def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:
 
 
 def from_files(directory: str | Path) -> Estimator:
-    """Return an estimator that reads ``NAME.png`` (16-bit KITTI, 0 unknown), ``NAME.pfm`` or ``NAME.npy``.
+    """Return an estimator that reads ``NAME.png`` (16-bit KITTI, 0 unknown), ``.pfm``, ``.npy``, ``.tiff`` or ``.tif``.
 
     For a name with folders, such as ``2003/cones``, the last part alone will do. All unknown pixels count as
     not measured, and are filled before scoring.
@@ -228,9 +237,9 @@ def from_files(directory: str | Path) -> Estimator:
 
     def estimate(frame: Frame) -> Estimate:
         for name in (frame.name, frame.name.rpartition("/")[2]):
-            for ending in (".png", ".pfm", ".npy"):
+            for ending in _MAPS:
                 if (path := base / f"{name}{ending}").exists():
                     return Estimate(read_disparity(path))
-        raise FileError(f"no map {frame.name}.png, .pfm or .npy in {base}")
+        raise FileError(f"no map {frame.name}{', '.join(_MAPS)} in {str(base)!r}")
 
     return estimate

@@ -22,14 +22,15 @@ from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError, StereokitError
 from stereokit.kernels.trace import observed
+from stereokit.notices import collecting
+from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, StageTimer
 from stereokit_evaluation.data import datasets
 from stereokit_evaluation.data import frame as frames
-from stereokit_evaluation.scoring import kitti
-from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, StageTimer
 from stereokit_evaluation.data.frame import Frame
-from stereokit_evaluation.study.configurations import PEER, Configuration, describe_error, fingerprint, title
+from stereokit_evaluation.scoring import kitti
 from stereokit_evaluation.scoring.kitti import score
 from stereokit_evaluation.scoring.runner import Result, Scored, Skipped
+from stereokit_evaluation.study.configurations import PEER, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
 
 __all__ = ["Row", "Study", "measure", "run_study"]
@@ -92,7 +93,7 @@ class _Loaded:
 
     @cached_property
     def images(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        left, right = self.frame.load_left(gray=self.gray), self.frame.load_right(gray=self.gray)
+        left, right = self.frame.load_pair(gray=self.gray)
         if left.shape != right.shape:
             raise InputError(f"left and right must have one size, got {left.shape} and {right.shape}")
         return left, right
@@ -168,7 +169,7 @@ def run_study(
     common = [_source(), repeats, gray, about_times]
     try:
         for frame in every:
-            loaded = _Loaded(frame, gray)
+            loaded, doubts = _Loaded(frame, gray), list[str]()
             step(frame.name, sum(index in missing for index in range(len(configurations))))
             for index, configuration in enumerate(configurations):
                 if index in missing:
@@ -185,7 +186,9 @@ def run_study(
                     break
                 if record is None:
                     try:
-                        record = measure(configuration, loaded, repeats, warm=index in warm)
+                        with collecting() as lines:
+                            record = measure(configuration, loaded, repeats, warm=index in warm)
+                        doubts += lines
                     except ImportError as error:  # a refiner's runtime, asked for at its first call
                         missing[index] = describe_error(error)
                         continue
@@ -198,6 +201,8 @@ def run_study(
                 else:
                     study.reused += 1
                 done[index][frame.name] = record
+            for line in doubts[:1]:
+                tell(f"warning: {frame.name}: {line}")
     except KeyboardInterrupt:
         study.interrupted = True
     _pool(study, configurations, done, missing, failed)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from stereokit.errors import FileError
-from stereokit.io import write_bytes
+from stereokit.io import parsing, read_bytes, write_bytes
 from stereokit_evaluation.common.folders import make_folder
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.kitti import Counts, Regions, Score, Tally
@@ -71,9 +71,11 @@ class Store:
         if self.folder is None:
             return None
         try:
-            content = json.loads(self._file(path, key).read_bytes())
-            return Record(_score(content["score"]), {str(k): float(v) for k, v in content["ms"].items()})
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            file = self._file(path, key)
+            with parsing(file, "record"):
+                content = json.loads(read_bytes(file))
+                return Record(_score(content["score"]), {str(k): float(v) for k, v in content["ms"].items()})
+        except FileError:
             return None
 
     def put(self, path: str, key: str, record: Record, about: Mapping[str, Any]) -> None:
@@ -124,12 +126,7 @@ def frame_digest(frame: Frame) -> str:
 def _feed(found: Any, source: Any) -> None:
     """Add a source's content: a file's bytes, the parts of a partial function, an array."""
     if isinstance(source, Path):
-        try:
-            found.update(hashlib.sha256(source.read_bytes()).digest())
-        except FileNotFoundError as error:
-            raise FileError(f"no such file: {str(source)!r}") from error
-        except OSError as error:
-            raise FileError(f"cannot read {str(source)!r}: {error.strerror or error}") from error
+        found.update(hashlib.sha256(read_bytes(source)).digest())
     elif isinstance(source, partial):
         found.update(source.func.__qualname__.encode())
         for part in (*source.args, *source.keywords.values()):

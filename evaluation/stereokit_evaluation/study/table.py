@@ -8,10 +8,10 @@ from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
-from stereokit_evaluation.data import published
+from stereokit.cli.output import Table
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL
+from stereokit_evaluation.data import published
 from stereokit_evaluation.scoring.summary import figures
 from stereokit_evaluation.study.configurations import PEER, title
 from stereokit_evaluation.study.run import Row, Study

@@ -7,7 +7,6 @@ Jetson boards. A refiner that is not there is listed with the reason.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import InputError
-from stereokit.io import make_folder, write_bytes
+from stereokit.io import make_folder, parsing, write_bytes
 from stereokit_evaluation.common.fingerprint import fingerprint
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.synthetic.scenes import generate
@@ -57,7 +57,7 @@ def scene_pair(seed: int, cache: Path | None = None) -> Pair:
     """
     path = None if cache is None else cache / f"street-{seed}-{_fingerprint()}.npz"
     if path is not None and path.exists():
-        with np.load(path) as held:
+        with parsing(path, "street", "cache must hold streets of this program"), np.load(path) as held:
             content = {name: held[name] for name in ("left", "right", "noc", "occ")}
     else:
         content = _render(seed)

@@ -154,7 +154,7 @@ def run_training(
         where = [(frame.name, name) for frame in held_out for name in methods]
         looked_at = Shelf([path for frame in held_out for path in truth[frame.name]])
         seen = [*(f"{dataset}/{frame.name}" for frame in training), *more]
-        outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world, seen)
+        outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world, seen, max_disparity)
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})
     return {
         "refiner": refiner, "settings": asdict(chosen), "methods": methods, "streets": streets,
@@ -228,7 +228,7 @@ def _join_group(torch: Any) -> tuple[int, int]:
 
 def _train_one(
     refiner: str, sources: Any, looked_at: Sequence[Any], where: Sequence[tuple[str, str]], settings: Any, start: Any,
-    folder: Path, world: tuple[int, int], seen: Sequence[str],
+    folder: Path, world: tuple[int, int], seen: Sequence[str], max_disparity: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Train, calibrate, write the folder; return the counts of bad and known pixels by matcher."""
     from stereokit_refiners.training.loop import bad_pixels, calibrated, fit, predict, restored
@@ -259,6 +259,7 @@ def _train_one(
     if world[0] == 0:
         ranges = calibrated(module, settings.form, sources)
         notes = {
+            "disparities": [0, max_disparity],
             "frames": sorted(seen),
             "settings": asdict(settings),
             "start": None if start is None else start.fingerprint,

@@ -84,6 +84,9 @@ class Ops(Protocol[T]):
     def twice(self, x: T) -> T:
         """Return x at double size, bilinearly, pixel centres kept."""
 
+    def repeat(self, x: T) -> T:
+        """Return x at double size, each pixel four times."""
+
 
 class Network(Protocol):
     """A network as data and as a function."""
@@ -167,6 +170,8 @@ class _Sizes:
 
     def twice(self, x: Any) -> Any:
         return x[0], 2 * x[1], 2 * x[2]
+
+    repeat = twice
 
 
 def activations(network: Network) -> dict[str, int]:

@@ -7,7 +7,7 @@ to [0, 1], ``disparity / 256`` and ``grey / 255``, and the output is the map its
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 
 from stereokit.errors import OptionError
 
-__all__ = ["FORMS", "check_form", "encode", "half_image"]
+__all__ = ["BEGINNING", "FORMS", "base_of", "check_form", "encode", "half_image"]
+
+BEGINNING = 4.0
+"""Where maps of the training begin at most, half-size pixels."""
 
 FORMS = ("residual", "literal")
 
@@ -27,6 +30,32 @@ def check_form(form: str, known: tuple[str, ...] = FORMS, network: str = "") -> 
         owner = f" of {network!r}" if network else ""
         raise OptionError(f"form{owner} must be one of {', '.join(known)}, got {form!r}")
     return form
+
+
+def base_of(maps: Sequence[NDArray[np.float32]]) -> float:
+    """Return what a network's maps are lowered by, whole half-size pixels, so that they begin as those of the training.
+
+    Parameters
+    ----------
+    maps : sequence of (..., h, w) float32
+        The coarse map, half-size pixels, and, if the network sees them, its candidates.
+
+    Returns
+    -------
+    float
+        Below zero, where a map goes below: its lowest value. Above zero, where the coarse map begins above
+        `BEGINNING`: by as much. It begins where a hundredth of its pixels lies below, but for the columns at the left
+        that lie outside the right view at the map's median: what stands there was not measured.
+    """
+    lowest = min(np.floor(one.min()) for one in maps)
+    if lowest < 0:
+        return float(lowest)
+    values = maps[0]
+    middle = np.partition(values, (values.size - 1) // 2, axis=None)[(values.size - 1) // 2]
+    columns = np.arange(values.shape[1])
+    seen = np.where(columns >= min(middle, values.shape[1] // 2), values, np.inf)
+    first = np.partition(seen, values.size // 100, axis=None)[values.size // 100]
+    return max(0.0, float(np.floor(first - BEGINNING)))
 
 
 def half_image(left: NDArray[Any]) -> NDArray[np.float32]:

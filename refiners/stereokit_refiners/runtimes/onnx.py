@@ -14,6 +14,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from stereokit.errors import OptionError
 from stereokit_refiners.networks.layers import Network, Weights, sub_pixel_kernel
 from stereokit_refiners.networks.pyramid import CANDIDATES, OFFSETS
 
@@ -83,6 +84,15 @@ class _OnnxOps:
         scales = self.constant([1, 1, 2, 2])
         return str(self.node("Resize", [x, "", scales], mode="linear", coordinate_transformation_mode="half_pixel"))
 
+    def repeat(self, x: str) -> str:
+        scales = self.constant([1, 1, 2, 2])
+        return str(
+            self.node(
+                "Resize", [x, "", scales], mode="nearest", coordinate_transformation_mode="asymmetric",
+                nearest_mode="floor",
+            )
+        )  # fmt: skip
+
     def slice(self, x: str, axis: int, start: int, stop: int) -> str:
         where = [self.constant([value], np.int64) for value in (start, stop, axis)]
         return str(self.node("Slice", [x, *where]))
@@ -113,7 +123,14 @@ def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
     Inputs ``coarse``, (1, 1, h, w), half-size pixels, filled; ``left``, (1, 1, 2h, 2w), grey levels 0 to 255; for
     networks that use them ``confidence``, (1, 1, h, w), 0 to 1, and ``candidates``, (1, 2, h, w), half-size pixels.
     Output ``disparity``, (1, 1, 2h, 2w), full-size pixels.
+
+    Raises
+    ------
+    OptionError
+        If the network sees more than that.
     """
+    if "disparity" not in network.inputs:
+        raise OptionError(f"network must be one that sees a half-size map alone to be exported, got {network.name!r}")
     ops = _OnnxOps(network, weights)
     literal = form == "literal"
     inputs: dict[str, list[Any]] = {"coarse": [1, 1, "h", "w"], "left": [1, 1, "2h", "2w"]}

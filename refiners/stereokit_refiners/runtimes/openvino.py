@@ -83,12 +83,16 @@ class _OpenVinoOps:
         return y if scale is None else self._rounded(y, float(scale.max()), np.ones_like(scale))
 
     def twice(self, x: Any) -> Any:
+        return self._doubled(x, mode="linear_onnx", coordinate_transformation_mode="half_pixel")
+
+    def repeat(self, x: Any) -> Any:
+        return self._doubled(x, mode="nearest", coordinate_transformation_mode="asymmetric", nearest_mode="floor")
+
+    def _doubled(self, x: Any, mode: str, **attributes: str) -> Any:
         rows, columns = x.get_output_shape(0)[2:]
         sizes = op.constant(np.array([2 * rows, 2 * columns], np.int64))
-        return op.interpolate(
-            self._unscaled(x), sizes, "linear_onnx", "sizes", coordinate_transformation_mode="half_pixel",
-            axes=op.constant(np.array([2, 3], np.int64)),
-        )  # fmt: skip
+        axes = op.constant(np.array([2, 3], np.int64))
+        return op.interpolate(self._unscaled(x), sizes, mode, "sizes", axes=axes, **attributes)
 
     def _scale(self, name: str) -> NDArray[np.float32] | None:
         return np.maximum(np.asarray(self.ranges[name], np.float32), 1e-3) if name in self.ranges else None

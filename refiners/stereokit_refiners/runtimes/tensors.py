@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from stereokit.errors import InputError, OptionError
+from stereokit_refiners.runtimes.encode import BEGINNING
 from stereokit_refiners.runtimes.torch import Module, compose
 from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
 
@@ -102,17 +103,17 @@ class TensorRefiner:
         height, width = disparity.shape
         below, beside = -height % self.network.multiple, -width % self.network.multiple
         with torch.inference_mode():
-            lowest = (
-                torch.minimum(disparity.min(), two.min()) if "candidates" in self.network.inputs else disparity.min()
-            )
-            shift = lowest.float().floor().clamp(max=0)  # as in LearnedRefiner; the host never sees it
+            given = [disparity.float(), two.float()] if "candidates" in self.network.inputs else [disparity.float()]
+            lowest = torch.stack([one.min() for one in given]).min()
+            highest = torch.stack([one.max() for one in given]).max()
+            shift = _base_of(given[0], lowest)
             disparity = _extended((disparity.float() - shift) * 2, below, beside)
             known = _extended(known.float(), below, beside)
             two = _extended((two.float() - shift) * 2, below, beside)
             gray = _extended(image.float(), 2 * (height + below) - rows, 2 * (width + beside) - columns)
             heads = self._module(self._encoded(disparity, known, two, gray))
             full = compose(self.network.name, self.content.form, heads["map"], disparity, two)
-            return (full[0, 0, :rows, :columns] + 2 * shift).contiguous()
+            return (full[0, 0, :rows, :columns] + 2 * shift).clamp(2 * lowest, 2 * highest).contiguous()
 
     def _encoded(self, disparity: Tensor, confidence: Tensor, two: Tensor, left: Tensor) -> dict[str, Tensor]:
         """Return the network's inputs: `stereokit_refiners.runtimes.encode.encode` in torch."""
@@ -159,6 +160,16 @@ def upscaled(image: Tensor, gain: float, rows: int, columns: int) -> Tensor:
         pair = [(image * 0.75 + other * 0.25) * factor for other in (before, after)]
         image = torch.stack(pair, axis + 1).flatten(axis, axis + 1)
     return image[:rows, :columns].contiguous()
+
+
+def _base_of(disparity: Tensor, lowest: Tensor) -> Tensor:
+    """Return what `base_of` returns of a map, (h, w), and the lowest value of all maps; the host never sees it."""
+    width = disparity.shape[1]
+    columns = torch.arange(width, device=disparity.device)
+    hidden = columns < disparity.median().clamp(max=width // 2)
+    seen = disparity.masked_fill(hidden, torch.inf).reshape(-1)
+    first = torch.kthvalue(seen, seen.numel() // 100 + 1).values
+    return torch.where(lowest < 0, lowest.floor(), (first - BEGINNING).floor().clamp(min=0))
 
 
 def _tensor(held: Any) -> Tensor:

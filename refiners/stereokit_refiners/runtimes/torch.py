@@ -116,6 +116,9 @@ class _TorchOps:
     def twice(self, x: Tensor) -> Tensor:
         return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
+    def repeat(self, x: Tensor) -> Tensor:
+        return F.interpolate(x, scale_factor=2, mode="nearest")
+
 
 def _joined(inputs: Sequence[Tensor]) -> Tensor:
     return inputs[0] if len(inputs) == 1 else torch.cat(list(inputs), 1)

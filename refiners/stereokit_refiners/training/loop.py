@@ -23,8 +23,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stereokit.errors import FileError, OptionError
-from stereokit.io import make_folder, write_bytes
+from stereokit.errors import OptionError
+from stereokit.io import make_folder, parsing, write_bytes
 from stereokit_refiners.networks.layers import Network, Weights
 from stereokit_refiners.runtimes.encode import check_form, encode
 from stereokit_refiners.runtimes.torch import Module, calibrate, compose
@@ -227,21 +227,19 @@ def fit(
     first, best, best_arrays, misses = 0, float("inf"), None, 0
     losses: list[float] = []  # since the last look
     if checkpoint is not None and checkpoint.exists():
-        try:
+        with parsing(checkpoint, "checkpoint", "checkpoint must be one of this program's"):
             state = torch.load(checkpoint, map_location=device, weights_only=True)
-        except Exception as error:  # of many kinds, by what is broken
-            reason = type(error).__name__
-            raise FileError(f"checkpoint must be one of this program's, got {str(checkpoint)!r} ({reason})") from None
         if not isinstance(state, dict) or state.get("identity") != identity:
             raise OptionError(
                 f"checkpoint {str(checkpoint)!r} is of other settings; remove it or choose another folder"
             )
-        module.load_state_dict(state["module"])
-        average.load_state_dict(state["average"])
-        optimizer.load_state_dict(state["optimizer"])
-        history.rows = [tuple(row) for row in state["history"]]
-        first, best, misses, losses = state["step"], state["best"], state["misses"], state["losses"]
-        best_arrays = {k: v.numpy() for k, v in state["best_arrays"].items()} or None
+        with parsing(checkpoint, "checkpoint", "checkpoint must be one of this program's"):
+            module.load_state_dict(state["module"])
+            average.load_state_dict(state["average"])
+            optimizer.load_state_dict(state["optimizer"])
+            history.rows = [tuple(row) for row in state["history"]]
+            first, best, misses, losses = state["step"], state["best"], state["misses"], state["losses"]
+            best_arrays = {k: v.numpy() for k, v in state["best_arrays"].items()} or None
 
     def save(step: int) -> None:
         if checkpoint is None or rank > 0:

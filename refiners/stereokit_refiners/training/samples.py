@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,10 +23,10 @@ from numpy.typing import NDArray
 
 import stereokit
 from stereokit.defaults import defaults_of
-from stereokit.errors import FileError
-from stereokit.io import make_folder, write_bytes
+from stereokit.io import make_folder, parsing, write_bytes
 from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
+from stereokit.notices import collecting
 from stereokit.result import Disparity
 from stereokit_refiners.training.augment import Views, mirrored, moved_objects, photographed, rescaled
 
@@ -212,7 +211,9 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     noc, occ = views.noc, views.occ
     left, right = _even(views.left), _even(views.right)
     keeper = _Keeper()
-    stereokit.Matcher(method, max_disparity=max_disparity, scale=0.5, refiner=keeper, threads=1, **options)(left, right)
+    matcher = stereokit.Matcher(method, max_disparity=max_disparity, scale=0.5, refiner=keeper, threads=1, **options)
+    with collecting():  # hard pairs are wanted
+        matcher(left, right)
     found = keeper.coarse
     height, width = left.shape
     truth = np.zeros((height, width), np.uint16)
@@ -292,8 +293,8 @@ def store_variant(pair: Pair, method: str, seed: int, number: int, max_disparity
 
 
 def _read(path: Path) -> Sample:
-    try:
-        with path.open("rb") as file, np.load(file) as held:
+    with parsing(path, "sample", "cache must hold samples of this program"), path.open("rb") as file:
+        with np.load(file) as held:
             return Sample(
                 held["coarse"],
                 held["confidence"],
@@ -303,8 +304,6 @@ def _read(path: Path) -> Sample:
                 held["seen"],
                 tuple(held["size"].tolist()),
             )
-    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-        raise FileError(f"cache must hold samples of this program, cannot read {str(path)!r} ({error})") from None
 
 
 class Shelf(Sequence[Sample]):

@@ -53,12 +53,13 @@ const Maps = (() => {
 
   const word = ([r, g, b]) => (0xff000000 | (b << 16) | (g << 8) | r) >>> 0;
 
-  function disparityPicture(values, width, height, top, turbo) {
+  function disparityPicture(values, width, height, bottom, top, turbo) {
     const colours = Uint32Array.from(turbo, word);
     return picture(width, height, (pixels) => {
       for (let i = 0; i < pixels.length; i++) {
         const v = values[i];
-        pixels[i] = v !== v ? 0xff000000 : colours[v <= 0 ? 0 : v >= top ? 255 : Math.round((255 * v) / top)];
+        const share = v <= bottom ? 0 : v >= top ? 1 : (v - bottom) / (top - bottom);
+        pixels[i] = v !== v ? 0xff000000 : colours[Math.round(255 * share)];
       }
     });
   }

@@ -26,7 +26,7 @@ const Viewer = (() => {
       const error = pair.truthValues
         ? Maps.errorPicture(values, pair.truthValues, pair.seenValues, width, height, rules.error)
         : null;
-      const disparity = Maps.disparityPicture(values, width, height, pair.top, rules.turbo);
+      const disparity = Maps.disparityPicture(values, width, height, pair.bottom, pair.top, rules.turbo);
       return (held[index] = { name: entry.name, values, measured, disparity, error });
     }
 
@@ -66,6 +66,7 @@ const Viewer = (() => {
       Object.assign(state, { pair, a, b });
       root.querySelector(".views").classList.toggle("blind", !pair.truthValues);
       root.querySelectorAll("[data-needs-truth]").forEach((e) => (e.hidden = !pair.truthValues));
+      get("bottom").textContent = pair.bottom.toFixed(0);
       get("top").textContent = `${pair.top.toFixed(0)} px`;
       const step = [...controls.frame.options].findIndex((o) => o.selected);
       get("previous").disabled = step <= 0;

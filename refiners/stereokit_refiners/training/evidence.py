@@ -1,0 +1,381 @@
+"""Training of `stereokit_refiners.networks.evidence.Evidence`: on pairs with dense truth, from generated scenes.
+
+``python -m stereokit_refiners.training.evidence samples PAIRS FOLDER`` matches each pair of a folder under many
+conditions and stores what the network sees of it, and ``... fit FOLDER OUTPUT`` trains on these, from the checkpoint
+OUTPUT.pt if there is one. Both may run at once: samples that appear are taken up.
+
+A pair is an ``.npz`` file with ``left``, ``right`` (H, W) uint8, ``truth`` (H, W) float32, pixels, and ``seen`` (H, W)
+bool, whether the right camera sees it too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+import stereokit
+from stereokit.result import Disparity
+from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, VALUES, Evidence
+from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.torch import Module, calibrate
+from stereokit_refiners.weights import WeightFile, write
+
+__all__ = ["fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
+
+_INPUT_STEPS = 40.0  # of the network's input, which lies between -3 and 3, in a byte
+_FIELDS: dict[str, tuple[int, Any]] = {
+    "input": (sum(CHANNELS.values()), np.int8),
+    "others": (16, np.float16),  # the last four values less the mean of the coarse map over 2x2
+    "within": (16, np.float16),  # the coarse map less that mean, by pixel of the 4x4
+    "small": (LOGITS, np.int8),  # evidence over the small and over the large window
+    "large": (LOGITS, np.int8),
+    "miss": (16, np.float16),  # truth less coarse map
+    "kind": (16, np.uint8),  # 0 truth unknown, 1 seen by both cameras, 2 by the left one only
+}
+"""What is stored of each 4x4 pixels."""
+
+_SCALE_CHANNEL = 69
+_OCCLUDED = 0.3  # weight of pixels that the right camera does not see
+_HARM = 0.7  # how much more it counts to make a pixel worse than to make another one better by as much
+_TOO_HARD = 0.35  # samples with a larger share of outliers teach nothing
+
+
+def _folded(plane: NDArray[Any], side: int) -> NDArray[Any]:
+    height, width = plane.shape
+    parts = plane.reshape(height // side, side, width // side, side).transpose(1, 3, 0, 2)
+    return np.asarray(parts.reshape(side * side, height // side, width // side))
+
+
+def packed(fields: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    """Return (C, h, w) arrays by name as one (h, w, bytes) array; see `unpacked`."""
+    parts = []
+    for name, (channels, dtype) in _FIELDS.items():
+        array = fields[name]
+        if name == "input":
+            array = np.clip(np.rint(array * _INPUT_STEPS), -127, 127)
+        elif dtype == np.float16:
+            array = np.clip(array, -6e4, 6e4)
+        moved = np.ascontiguousarray(array.transpose(1, 2, 0).astype(dtype))
+        assert moved.shape[2] == channels
+        parts.append(moved.view(np.uint8).reshape(*moved.shape[:2], -1))
+    return np.concatenate(parts, 2)
+
+
+def unpacked(record: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    """Return arrays by name, (..., C), of what `packed` made."""
+    found, at = {}, 0
+    for name, (channels, dtype) in _FIELDS.items():
+        size = channels * np.dtype(dtype).itemsize
+        found[name] = np.ascontiguousarray(record[..., at : at + size]).view(dtype)
+        at += size
+    return found
+
+
+class _Keeper:
+    """A refiner that keeps what it is given."""
+
+    needs_candidates = True
+    needs_confidence = True
+    any_scale = True
+
+    def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1, scale: float = 1) -> Disparity:
+        self.coarse = coarse
+        return Disparity(np.zeros(left.shape, np.float32), np.zeros(left.shape, np.bool_))
+
+
+def make_sample(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], truth: NDArray[np.float32], seen: NDArray[np.bool_],
+    method: str, scale: float, **options: Any,
+) -> tuple[NDArray[np.uint8], float]:  # fmt: skip
+    """Match a pair; return what the network sees and should make of it, and the coarse map's share of outliers."""
+    known = np.isfinite(truth)
+    farthest = float(truth[known].max())
+    keeper = _Keeper()
+    levels = int(np.ceil((farthest + 8) / 32) * 32)
+    stereokit.Matcher(
+        method, max_disparity=levels, scale=scale, refiner=keeper, threads=1, device="cpu", **options
+    )(left, right)  # fmt: skip
+    coarse = keeper.coarse
+    assert coarse.candidates is not None
+    assert coarse.confidence is not None
+    found = hypotheses(coarse.disparity, coarse.candidates, left, right, round(1 / scale))
+    half = np.mean([found.coarse[i::2, j::2] for i in (0, 1) for j in (0, 1)], axis=0)
+    upscaled = (found.coarse + np.float32(found.base))[: left.shape[0], : left.shape[1]]
+    miss = np.zeros(found.coarse.shape, np.float32)
+    kind = np.zeros(found.coarse.shape, np.uint8)
+    miss[: left.shape[0], : left.shape[1]] = np.where(known, truth - upscaled, 0)
+    kind[: left.shape[0], : left.shape[1]] = np.where(known, np.where(seen, 1, 2), 0)
+
+    def evidence(means: NDArray[np.uint8]) -> NDArray[Any]:
+        gains = np.clip(means[:1].astype(np.int16) - means[1:], -127, 127)
+        return np.concatenate([_folded(gain, 4) for gain in gains])
+
+    fields = {
+        "input": network_input(found, coarse.confidence, left, left.shape[1]),
+        "others": np.concatenate([_folded(values - half, 2) for values in found.others]),
+        "within": _folded(found.coarse - half.repeat(2, 0).repeat(2, 1), 4),
+        "small": evidence(found.small),
+        "large": evidence(found.large),
+        "miss": _folded(miss, 4),
+        "kind": _folded(kind, 4),
+    }
+    error = np.abs(upscaled - truth)[seen & known]
+    outliers = (error > 3) & (error > 0.05 * truth[seen & known])
+    return packed(fields)[: left.shape[0] // 4, : left.shape[1] // 4], float(outliers.mean())
+
+
+def photographed(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return a pair as poor cameras see it: dark, flat, blurred, noisy, saturated, of two gains, with rows off."""
+    a: Any = left.astype(np.float32)
+    b: Any = right.astype(np.float32)
+    if rng.random() < 0.35:
+        contrast = np.exp(rng.uniform(np.log(0.15), 0))
+        offset = rng.uniform(0, 200 * (1 - contrast))
+        a, b = a * contrast + offset, b * contrast + offset
+    if rng.random() < 0.3:
+        sigma = rng.uniform(0.3, 1.0)
+        a, b = cv2.GaussianBlur(a, (0, 0), sigma), cv2.GaussianBlur(b, (0, 0), sigma * rng.uniform(0.8, 1.2))
+    if rng.random() < 0.4:
+        b = b * np.exp(rng.normal(0, 0.1)) + rng.normal(0, 4)
+    if rng.random() < 0.35:
+        brighter = rng.uniform(1.1, 2.0)
+        a, b = a * brighter, b * brighter
+    if rng.random() < 0.5:
+        noise = np.exp(rng.uniform(np.log(0.3), np.log(3)))
+        a, b = (image + rng.normal(size=image.shape) * noise for image in (a, b))
+    if rng.random() < 0.35:
+        slope = np.array([[1, 0, 0], [rng.normal(0, 0.3) / a.shape[1], 1, rng.normal(0, 0.25)]], np.float32)
+        b = cv2.warpAffine(b, slope, b.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    one, two = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in (a, b))
+    return one, two
+
+
+def _store(pairs: Path, folder: Path, most: int) -> None:
+    """Store up to `most` samples of each pair; those that are there are left as they are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(most):
+        for path in sorted(pairs.glob("*.npz")):
+            if any(folder.glob(f"{path.stem}_{number:02d}_*.npy")):
+                continue
+            rng = np.random.default_rng([number, zlib.crc32(path.stem.encode())])
+            with np.load(path) as pair:
+                left, right, truth, seen = (pair[name] for name in ("left", "right", "truth", "seen"))
+            if rng.random() < 0.5:
+                left, right, truth, seen = (np.ascontiguousarray(x[::-1]) for x in (left, right, truth, seen))
+            if number or rng.random() < 0.7:
+                left, right = photographed(left, right, rng)
+            method = str(rng.choice(["S1", "S2", "S2", "S2", "S3", "S4", "S4"]))
+            scale = float(rng.choice([1, 0.5, 0.5, 0.5, 0.25] if number else [1, 0.5, 0.5]))
+            options = {} if rng.random() < 0.5 else {"smooth": float(0.5 * np.exp(rng.normal(0, 0.3)))}
+            record, outliers = make_sample(left, right, truth.astype(np.float32), seen, method, scale, **options)
+            name = folder / f"{path.stem}_{number:02d}_{method}_{1000 * outliers:03.0f}.npy"
+            part = name.with_suffix(".part")
+            with open(part, "wb") as stream:
+                np.save(stream, record)
+            os.replace(part, name)
+
+
+def mixture(
+    head: Tensor, others: Tensor, within: Tensor, small: Tensor, large: Tensor, apart: Tensor
+) -> Tensor:  # fmt: skip
+    """Return the map less the coarse one, (B, 16, h, w): the twin of `stereokit_refiners.runtimes.mixture.mixture`.
+
+    Parameters
+    ----------
+    head : (B, C, h, w)
+    others, within, small, large : (B, ., h, w)
+        As they are stored.
+    apart : (B,)
+        How far "less" and "more" are from the coarse map, pixels.
+    """
+    batch, _, height, width = head.shape
+    count = len(VALUES) - 1
+    logits = head[:, :LOGITS].view(batch, count, 16, height, width)
+    gains = head[:, LOGITS : LOGITS + GAINS] / 16
+    for part, first in ((small, 0), (large, 2)):
+        gain = torch.stack([gains[:, first + (k >= 2)] for k in range(count)], 1)[:, :, None]
+        logits = logits + gain * part.view(batch, count, 16, height, width)
+    weights = logits.clamp(-40, 40).exp()
+    four = others.view(batch, 4, 2, 1, 2, 1, height, width).expand(-1, -1, -1, 2, -1, 2, -1, -1)
+    differences = four.reshape(batch, 4, 16, height, width) - within[:, None]
+    more = apart.view(batch, 1, 1, 1, 1).expand(batch, 1, 16, height, width)
+    differences = torch.cat([-more, more, differences], 1)
+    return (weights * differences).sum(1) / (1 + weights.sum(1))
+
+
+def _badness(error: Tensor) -> Tensor:
+    """Return what an error counts: soft counts of those over about 1 and over about 3 pixels, and a clipped L1."""
+    square = error * error
+    return square / (square + 0.6) + 0.7 * square / (square + 7) + 0.08 * error.clamp(max=30)
+
+
+def loss(head: Tensor, fields: dict[str, Tensor], apart: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the loss, and that of the coarse map alone."""
+    given = {name: fields[name].float() for name in ("others", "within", "small", "large")}
+    out = mixture(head, given["others"], given["within"], given["small"], given["large"], apart)
+    miss, kind = fields["miss"].float(), fields["kind"]
+    weight = (kind == 1).float() + _OCCLUDED * (kind == 2).float()
+    error = (out - miss).abs()
+    now, before = _badness(error), _badness(miss.abs())
+    total = weight.sum().clamp(min=1)
+    main = ((now + _HARM * F.relu(now - before)) * weight).sum() / total
+    batch, _, height, width = error.shape
+
+    def by_four(pixels: Tensor) -> Tensor:
+        return pixels.view(batch, 2, 2, 2, 2, height, width).mean((2, 4)).reshape(batch, 4, height, width)
+
+    right = by_four((error.detach() < 1.5).float())
+    sure = F.binary_cross_entropy_with_logits(head[:, LOGITS + GAINS :], right, reduction="none")
+    return main + 0.2 * (sure * by_four(weight)).sum() / total, (before * weight).sum() / total
+
+
+def _begun(module: Module) -> None:
+    """Start at the identity: the coarse value has nearly all the weight."""
+    with torch.no_grad():
+        bias = module.weights["head-bias"]
+        bias[:LOGITS] = -3
+        bias[LOGITS : LOGITS + GAINS] = 0.3
+
+
+def _batches(folder: Path, batch: int, size: tuple[int, int], rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
+    """Yield random crops, `size` blocks of 4x4 pixels each; the folder is looked at again every minute."""
+    seen = -1e9
+    while True:
+        if time.monotonic() - seen > 60:
+            paths = sorted(folder.glob("*.npy"))
+            outliers = np.array([int(path.stem.rpartition("_")[2]) / 1000 for path in paths])
+            shares = np.where(outliers > _TOO_HARD, 0, 1 / (1 + (outliers / 0.12) ** 2)).cumsum()
+            seen = time.monotonic()
+        crops: list[NDArray[np.uint8]] = []
+        while len(crops) < batch:
+            record = np.load(paths[int(np.searchsorted(shares, rng.random() * shares[-1]))], mmap_mode="r")
+            if record.shape[0] < size[0] or record.shape[1] < size[1]:
+                continue
+            y, x = (int(rng.integers(0, record.shape[k] - size[k] + 1)) for k in (0, 1))
+            crops.append(np.array(record[y : y + size[0], x : x + size[1]]))
+        yield {name: torch.from_numpy(a).permute(0, 3, 1, 2) for name, a in unpacked(np.stack(crops)).items()}
+
+
+def _input_of(fields: dict[str, Tensor]) -> Tensor:
+    return (fields["input"].float() / _INPUT_STEPS).contiguous(memory_format=torch.channels_last)
+
+
+def fit(
+    folder: Path, output: Path, *, steps: int = 30000, rate: float = 2e-3, batch: int = 4, seed: int = 0,
+    start: Path | None = None, size: tuple[int, int] = (64, 96), notes: dict[str, Any] | None = None,
+    report: int = 200,
+) -> WeightFile:  # fmt: skip
+    """Train on stored samples, from a checkpoint if there is one, and write the weights.
+
+    Parameters
+    ----------
+    folder : Path
+        Of samples.
+    output : Path
+        Weight file; the checkpoint is beside it, ``.pt``.
+    steps, batch, seed : int
+    rate : float
+        Learning rate after the first 200 steps; down a cosine.
+    start : Path or None
+        Checkpoint whose averaged weights to begin with.
+    size : tuple of int
+        Crops in blocks of 4x4 pixels, multiples of 8.
+    notes : dict or None
+        For the weight file.
+    report : int
+        Steps between lines on standard output.
+    """
+    network = Evidence()
+    module = Module(network, torch.Generator().manual_seed(seed))
+    _begun(module)
+    module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(module.parameters(), lr=rate, weight_decay=1e-4, betas=(0.9, 0.99))
+    checkpoint, done = output.with_suffix(".pt"), 0
+    if start is not None:
+        module.load_state_dict(torch.load(start)["average"])
+    average = {name: value.clone() for name, value in module.state_dict().items()}
+    if checkpoint.is_file():
+        held = torch.load(checkpoint)
+        module.load_state_dict(held["module"])
+        optimizer.load_state_dict(held["optimizer"])
+        average, done = held["average"], held["done"]
+    rng = np.random.default_rng([seed, done])
+    batches = _batches(folder, batch, size, rng)
+    compiled = torch.compile(loss)
+    saved = time.monotonic()
+    while done < steps:
+        for group in optimizer.param_groups:
+            cosine = 0.5 * (1 + np.cos(np.pi * done / steps))
+            group["lr"] = float(rate * min(1, (done + 1) / 200) * (0.02 + 0.98 * cosine))
+        fields = next(batches)
+        given = _input_of(fields)
+        apart = torch.where(given[:, _SCALE_CHANNEL, 0, 0] > 0.5, 2.0, 1.0)
+        with torch.autocast("cpu", torch.bfloat16):
+            head = module({"evidence": given})["map"]
+        value, before = compiled(head.float().contiguous(), fields, apart)
+        optimizer.zero_grad()
+        value.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(module.parameters(), 5.0)
+        optimizer.step()
+        done += 1
+        with torch.no_grad():
+            keep = min(0.999, (1 + done) / (50 + done))
+            for name, tensor in module.state_dict().items():
+                average[name].mul_(keep).add_(tensor, alpha=1 - keep)
+        if done % report == 0:
+            print(f"{done} loss {float(value.detach()):.4f}, of the coarse maps {float(before):.4f}", flush=True)
+        if done == steps or time.monotonic() - saved > 120:
+            state = {"module": module.state_dict(), "optimizer": optimizer.state_dict(), "average": average}
+            part = checkpoint.with_suffix(".part")
+            torch.save({**state, "done": done}, part)
+            os.replace(part, checkpoint)
+            saved = time.monotonic()
+    module.load_state_dict(average)
+    ranges = calibrate(module, ({"evidence": _input_of(next(batches))} for _ in range(16)))
+    content = WeightFile(
+        "evidence", "residual", module.arrays(), ranges, {**(notes or {}), "steps": done, "seed": seed}
+    )
+    write(output, content)
+    return content
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    samples = commands.add_parser("samples")
+    samples.add_argument("pairs", type=Path)
+    samples.add_argument("folder", type=Path)
+    samples.add_argument("--each", type=int, default=5)
+    train = commands.add_parser("fit")
+    train.add_argument("folder", type=Path)
+    train.add_argument("output", type=Path)
+    train.add_argument("--steps", type=int, default=30000)
+    train.add_argument("--rate", type=float, default=2e-3)
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--start", type=Path)
+    train.add_argument("--threads", type=int, default=1)
+    given = parser.parse_args()
+    if given.command == "samples":
+        _store(given.pairs, given.folder, given.each)
+        return
+    torch.set_num_threads(given.threads)
+    fit(given.folder, given.output, steps=given.steps, rate=given.rate, seed=given.seed, start=given.start)
+
+
+if __name__ == "__main__":
+    main()

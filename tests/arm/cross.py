@@ -1,0 +1,101 @@
+"""Compile the kernels of two methods for 64-bit ARM, on any machine, and count what their machine code does.
+
+Two steps, each in a process of its own, since numba decides for a processor when it is imported:
+
+    python cross.py record SIGNATURES           match a small pair, and keep what types the kernels were called with
+    python cross.py count SIGNATURES COUNTS     compile for these types, without running anything
+
+S2 and S3 have every hot kernel between them: both costs, both aggregations, the selection.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import pickle
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+
+TRIPLE = "aarch64-unknown-linux-gnu"
+METHODS = ("S2", "S3")
+HOT = ("first_visit", "_last_visit", "_produce_rows", "_filter_band", "_census_row", "_zncc_row", "select_row")
+"""Kernels that a frame's time goes to, by the name of their function."""
+
+KINDS = {
+    # a lane of a vector to a general register or back, one at a time: what scalarised code is made of
+    "lane_moves": r"(?:umov|smov)\b"
+    r"|mov\t[wx]\d+, v\d+\.[bhsd]\["
+    r"|(?:mov|ins)\tv\d+\.[bhsd]\[\d+\], [wx]"
+    r"|fmov\t(?:[wx]\d+, [sd]\d+|[sd]\d+, [wx]\d+)",
+    # vectors that did not fit in registers
+    "stack": r"(?:ldr|str|ldur|stur|ldp|stp)\tq\d+, (?:q\d+, )?\[(?:sp|x29)",
+    "cnt": r"cnt\tv|cnt\.",
+    "uqadd": r"uqadd\b",
+    "umin": r"umin\b",
+    "ext": r"ext\b",
+    "vector": r"\w+\tv\d+\.|\w+\.(?:16b|8b|8h|4h|4s|2s|2d)\t",
+    "all": r"[a-z]",
+}
+
+
+def record(path: str) -> None:
+    """Match a pair with each method; write the signatures of the hot kernels."""
+    import numpy as np
+    from numba.core.dispatcher import Dispatcher
+    from numba.core.serialize import dumps
+
+    import stereokit
+
+    image = np.random.default_rng(0).integers(0, 256, (24, 80), dtype=np.uint8)
+    for method in METHODS:
+        stereokit.Matcher(method, max_disparity=128, threads=1)(image, image)
+    found = {}
+    for name, module in sorted(sys.modules.items()):
+        for key in HOT:
+            kernel = vars(module).get(key) if name.startswith("stereokit.") else None
+            if isinstance(kernel, Dispatcher) and kernel.py_func.__module__ == name and kernel.signatures:
+                found[name, key] = [tuple(signature) for signature in kernel.signatures]
+    Path(path).write_bytes(dumps(found))
+
+
+def count(signatures: str, out: str) -> None:
+    """Compile for ARM and write how often each kind of instruction stands in a kernel's code."""
+    os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = "generic", ""
+    import llvmlite.binding as binding
+    from llvmlite.binding import targets
+
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    binding.get_process_triple = targets.get_process_triple = lambda: TRIPLE
+    try:
+        binding.Target.from_triple(TRIPLE)
+    except RuntimeError as error:
+        Path(out).write_text(json.dumps({"missing": str(error)}), encoding="utf-8")
+        return
+    binding.Target.from_default_triple = classmethod(lambda cls: cls.from_triple(TRIPLE))
+    import stereokit.matching  # noqa: F401 (its types come before the signatures)
+
+    table = {}
+    for (name, key), found in pickle.loads(Path(signatures).read_bytes()).items():
+        kernel = getattr(importlib.import_module(name), key)
+        for number, signature in enumerate(found):
+            kernel.compile(signature)
+            text = kernel.inspect_asm(kernel.signatures[-1])
+            table[f"{key}.{number}" if number else key] = counted(text)
+    Path(out).write_text(json.dumps(table), encoding="utf-8")
+
+
+def counted(text: str) -> dict[str, int]:
+    """Return how many instructions of each kind stand in a text of assembly."""
+    lines = [line.strip() for line in text.splitlines() if line.startswith("\t") and not line.startswith("\t.")]
+    found = Counter({kind: 0 for kind in KINDS})
+    for line in lines:
+        found.update(kind for kind, pattern in KINDS.items() if re.match(pattern, line))
+    return dict(found)
+
+
+if __name__ == "__main__":
+    {"record": record, "count": count}[sys.argv[1]](*sys.argv[2:])

@@ -1,0 +1,371 @@
+"""The evidence refiner's kernels against plain loops, and what must hold for any weights."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import stereokit
+from stereokit.errors import OptionError
+from stereokit_refiners.learned import EvidenceRefiner
+from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, Evidence
+from stereokit_refiners.networks.layers import shapes
+from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.mixture import mixture
+from stereokit_refiners.weights import WeightFile
+
+ROWS, COLUMNS = 13, 37
+
+
+def _case(step, seed=0, rows=ROWS, columns=COLUMNS, lowest=-3.0):
+    rng = np.random.default_rng(seed)
+    left, right = (rng.integers(0, 256, (rows, columns), dtype=np.uint8) for _ in range(2))
+    size = -(-rows // step), -(-columns // step)
+    disparity = (rng.random(size) * 9 + lowest).astype(np.float32)
+    candidates = (rng.random((2, *size)) * 9 + lowest).astype(np.float32)
+    confidence = rng.random(size).astype(np.float32)
+    return disparity, candidates, confidence, left, right
+
+
+def _at(image, y, x):
+    return image[min(max(y, 0), len(image) - 1), min(max(x, 0), image.shape[1] - 1)]
+
+
+def _grown(image, rows, columns):
+    return np.array([[_at(image, y, x) for x in range(columns)] for y in range(rows)])
+
+
+def _upscaled(coarse, step, y, x):
+    """Bilinear, pixel centres kept, borders clamped."""
+    v, u = (y + 0.5) / step - 0.5, (x + 0.5) / step - 0.5
+    y0, x0 = math.floor(v), math.floor(u)
+    a, b = v - y0, u - x0
+    top = (1 - b) * _at(coarse, y0, x0) + b * _at(coarse, y0, x0 + 1)
+    bottom = (1 - b) * _at(coarse, y0 + 1, x0) + b * _at(coarse, y0 + 1, x0 + 1)
+    return (1 - a) * top + a * bottom
+
+
+def _bits(image):
+    def smooth(y, x):
+        weights = (1, 4, 1)
+        return sum(weights[i] * weights[j] * int(_at(image, y + i - 1, x + j - 1)) for i in range(3) for j in range(3))
+
+    # The image is extended first, then smoothed: a neighbour outside is a smoothed pixel of the extended image.
+    height, width = image.shape
+    wide = {(y, x): smooth(y, x) for y in range(-2, height + 2) for x in range(-2, width + 2)}
+    offsets = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if (i, j) != (0, 0)]
+    return [[[wide[y + i, x + j] < wide[y, x] for i, j in offsets] for x in range(width)] for y in range(height)]
+
+
+def _plain(step, disparity, candidates, left, right):
+    """Return the coarse map, the other values, costs in eighths of a bit, and where the coarse match is outside."""
+    rows, columns = left.shape
+    height, width = (-(-n // 32) * 32 for n in (rows, columns))
+    h, w = height // step, width // step
+    fixed = [_grown(np.rint(m.astype(np.float64) * 256) / 256, h, w) * step for m in (disparity, *candidates)]
+    near = fixed[0]
+    coarse = np.array([[_upscaled(near, step, y, x) for x in range(width)] for y in range(height)])
+    extremes = []
+    for choose in (min, max):
+        extremes.append(
+            np.array(
+                [
+                    [choose(_at(near, y + i, x + j) for i in range(-3, 4) for j in range(-3, 4)) for x in range(w)]
+                    for y in range(h)
+                ]
+            )
+        )
+    maps = [*extremes, *fixed[1:]]
+    others = np.array([[[m[2 * y // step, 2 * x // step] for x in range(width // 2)] for y in range(height // 2)]
+                       for m in maps])  # fmt: skip
+    bits = [_bits(_grown(image, height, width)) for image in (left, right)]
+
+    def distance(y, x, at):
+        if not 0 <= at < columns:
+            return 12
+        return sum(a != b for a, b in zip(bits[0][y][x], bits[1][y][at], strict=True))
+
+    def cost(y, x, value):
+        eighths = math.floor(value * 8 + 0.5)
+        whole, part = eighths // 8, eighths % 8
+        return (8 - part) * distance(y, x, x - whole) + part * distance(y, x, x - whole - 1)
+
+    apart = 2 if step == 4 else 1
+    costs = np.zeros((7, height, width))
+    outside = np.zeros((height, width))
+    for y in range(height):
+        for x in range(width):
+            b = coarse[y, x]
+            values = [b, b - apart, b + apart, *(others[k, y // 2, x // 2] for k in range(4))]
+            costs[:, y, x] = [cost(y, x, v) for v in values]
+            outside[y, x] = not 0 <= x - math.floor(b * 8 + 0.5) // 8 < columns
+    return coarse, others, costs, outside
+
+
+def _mean(plane, side):
+    reach = side // 2
+    height, width = plane.shape
+    return np.array(
+        [
+            [
+                np.floor(
+                    sum(_at(plane, y + i, x + j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1))
+                    / side**2
+                    + 0.5
+                )
+                for x in range(width)
+            ]
+            for y in range(height)
+        ]
+    )
+
+
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_values_and_costs_are_those_of_plain_loops(step):
+    disparity, candidates, _, left, right = _case(step)
+    found = hypotheses(disparity, candidates, left, right, step)
+    coarse, others, costs, outside = _plain(step, disparity, candidates, left, right)
+    np.testing.assert_array_equal(found.coarse + found.base, coarse)
+    np.testing.assert_array_equal(found.others + found.base, others)
+    np.testing.assert_array_equal(found.costs, costs)
+    np.testing.assert_array_equal(found.outside, outside)
+    for k in (0, 4):
+        np.testing.assert_array_equal(found.small[k], _mean(found.costs[k].astype(int), 3))
+        np.testing.assert_array_equal(found.large[k], _mean(found.costs[k].astype(int), 7))
+
+
+def _plain_input(found, confidence, left, columns):
+    height, width = found.coarse.shape
+    step = found.step
+    image = _grown(left, height, width).astype(np.float64)
+    sure = _grown(confidence, height // step, width // step)
+    block = lambda plane, y, x, n: plane[n * y : n * y + n, n * x : n * x + n]  # noqa: E731
+    quarter = height // 4, width // 4
+    grid = [(y, x) for y in range(quarter[0]) for x in range(quarter[1])]
+    half = np.array([[block(found.coarse, y, x, 2).mean() for x in range(width // 2)] for y in range(height // 2)])
+    means = {name: np.zeros(quarter) for name in ("grey", "square", "coarse")}
+    for y, x in grid:
+        means["grey"][y, x] = block(image, y, x, 4).mean()
+        means["square"][y, x] = (block(image, y, x, 4) ** 2).mean()
+        means["coarse"][y, x] = block(found.coarse, y, x, 4).mean()
+
+    def around(plane, y, x, reach):
+        cells = range(-reach, reach + 1)
+        return np.mean([_at(plane, y + i, x + j) for i in cells for j in cells])
+
+    squash = lambda x, unit: 2 * x / (abs(x) + unit)  # noqa: E731
+    reach = (columns + 1) // 2
+    surface = np.zeros((5, *half.shape))
+    for y in range(half.shape[0]):
+        nearest = {}
+        for x in range(reach):
+            at = math.floor((2 * x - found.base - half[y, x]) / 2)
+            for place in (at, at + 1):
+                if 0 <= place < reach:
+                    nearest[place] = max(nearest.get(place, -1e9), half[y, x])
+        for k in range(5):
+            for x in range(half.shape[1]):
+                value = half[y, x] if k == 0 else found.others[k - 1, y, x]
+                at = math.floor((2 * x - found.base - value) / 2 + 0.5)
+                surface[k, y, x] = nearest[at] - value if at in nearest else 0
+    out = np.zeros((sum(CHANNELS.values()), *quarter))
+    for y, x in grid:
+        grey = around(means["grey"], y, x, 4)
+        spread = math.sqrt(max(around(means["square"], y, x, 4) - grey**2, 0))
+        levels = np.clip((block(image, y, x, 4) - grey) / (spread + 3), -3, 3)
+        by_two = lambda f: [f(2 * y + i, 2 * x + j) for i in (0, 1) for j in (0, 1)]  # noqa: B023, E731
+        column = [*levels.ravel()]
+        column += by_two(lambda v, u: 4 * sure[2 * v // step, 2 * u // step] - 2)
+        column += by_two(lambda v, u: squash(half[v, u] - around(means["coarse"], y, x, 8), 8))  # noqa: B023
+        for k in range(4):
+            column += by_two(lambda v, u: squash(found.others[k, v, u] - half[v, u], 2))  # noqa: B023
+        column += by_two(lambda v, u: block(found.small[0], v, u, 2).mean() / 32 - 1)
+        for k in range(1, 7):
+            less = found.costs[0].astype(float) - found.costs[k]
+            column += by_two(lambda v, u: block(less, v, u, 2).mean() / 32)  # noqa: B023
+        column += [block(found.outside, y, x, 4).mean(), {1: -1, 2: 0, 4: 1}[step]]
+        for k in range(5):
+            column += by_two(lambda v, u: squash(surface[k, v, u], 2))  # noqa: B023
+        out[:, y, x] = column
+    return out
+
+
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_the_networks_input_is_that_of_plain_loops(step):
+    disparity, candidates, confidence, left, right = _case(step, seed=1)
+    found = hypotheses(disparity, candidates, left, right, step)
+    given = network_input(found, confidence, left, COLUMNS)
+    np.testing.assert_allclose(given, _plain_input(found, confidence, left, COLUMNS), atol=2e-4)
+
+
+def _head(rng, found, scale=2.0):
+    height, width = found.coarse.shape
+    return (rng.normal(size=(height // 4, width // 4, LOGITS + GAINS + 4)) * scale).astype(np.float32)
+
+
+def _plain_mixture(head, found, y, x):
+    cell, phase = head[y // 4, x // 4].astype(np.float64), 4 * (y % 4) + x % 4
+    b = float(found.coarse[y, x])
+    values = [b, b - found.apart, b + found.apart, *(float(found.others[k, y // 2, x // 2]) for k in range(4))]
+    weights = [1.0]
+    for k in range(1, 7):
+        logit = cell[16 * (k - 1) + phase]
+        for plane, first in ((found.small, LOGITS), (found.large, LOGITS + 2)):
+            evidence = np.clip(int(plane[0, y, x]) - int(plane[k, y, x]), -127, 127)
+            logit += cell[first + (k > 2)] * evidence / 16
+        weights.append(math.exp(min(max(logit, -40), 40)))
+    sure = cell[LOGITS + GAINS + 2 * (y % 4 // 2) + x % 4 // 2]
+    return found.base + np.dot(weights, values) / sum(weights), 1 / (1 + math.exp(-sure))
+
+
+def test_the_mixture_is_that_of_plain_loops():
+    disparity, candidates, _, left, right = _case(2, seed=2)
+    found = hypotheses(disparity, candidates, left, right, 2)
+    head = _head(np.random.default_rng(3), found, 0.7)
+    full, sure = mixture(head, found, ROWS, COLUMNS)
+    for y in range(ROWS):
+        for x in range(COLUMNS):
+            assert (full[y, x], sure[y, x]) == pytest.approx(_plain_mixture(head, found, y, x), abs=2e-4)
+
+
+def test_a_head_that_refuses_all_others_leaves_the_upscaled_map():
+    disparity, candidates, _, left, right = _case(2, seed=4)
+    found = hypotheses(disparity, candidates, left, right, 2)
+    head = np.zeros_like(_head(np.random.default_rng(0), found))
+    head[..., :LOGITS] = -40
+    full, _ = mixture(head, found, ROWS, COLUMNS)
+    np.testing.assert_allclose(full, (found.coarse + found.base)[:ROWS, :COLUMNS], atol=1e-6)
+
+
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_threads_change_nothing(step):
+    disparity, candidates, confidence, left, right = _case(step, seed=5, rows=70, columns=90)
+    one, three = (hypotheses(disparity, candidates, left, right, step, threads) for threads in (1, 3))
+    for name in ("coarse", "others", "costs", "small", "large", "outside"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+    inputs = [network_input(one, confidence, left, 90, threads) for threads in (1, 3)]
+    np.testing.assert_array_equal(*inputs)
+    head = _head(np.random.default_rng(6), one)
+    for a, b in zip(*(mixture(head, one, 70, 90, threads) for threads in (1, 3)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("by", [8, -8, 200, 1000])
+def test_a_constant_added_to_all_disparities_changes_no_bit_of_the_input(by):
+    """The right view slides by as much; only what then leaves or enters it may differ."""
+    rng = np.random.default_rng(7)
+    rows, columns, margin = 40, 1600, 1100
+    left = rng.integers(0, 256, (rows, columns), dtype=np.uint8)
+    row = rng.integers(0, 256, (rows, columns + 2 * margin), dtype=np.uint8)
+    slid = [np.ascontiguousarray(row[:, margin + s : margin + s + columns]) for s in (0, by)]
+    size = rows // 2, columns // 2
+    disparity = rng.integers(0, 20 * 256, size).astype(np.float32) / 256  # what is kept of a map
+    candidates = rng.integers(0, 20 * 256, (2, *size)).astype(np.float32) / 256
+    confidence = rng.random(size).astype(np.float32)
+    found = [
+        hypotheses(disparity + np.float32(s / 2), candidates + np.float32(s / 2), left, right, 2)
+        for s, right in zip((0, by), slid, strict=True)
+    ]
+    assert found[1].base - found[0].base == by
+    np.testing.assert_array_equal(found[0].coarse, found[1].coarse)
+    inputs = [network_input(f, confidence, left, columns) for f in found]
+    inner = slice((max(by, 0) + 64) // 4, (columns - 64 + min(by, 0)) // 4)
+    np.testing.assert_array_equal(inputs[0][:, :, inner], inputs[1][:, :, inner])
+    head = _head(rng, found[0])
+    columns_in = slice(4 * inner.start + 8, 4 * inner.stop - 8)
+    maps = [mixture(head, f, rows, columns)[0][:, columns_in] for f in found]
+    np.testing.assert_allclose(maps[0] + np.float32(by), maps[1], atol=2e-4)
+
+
+def _weights(seed=0, scale=0.3):
+    rng = np.random.default_rng(seed)
+    arrays = {
+        name: (rng.normal(size=shape) * scale / max(1, math.prod(shape[1:])) ** 0.5).astype(np.float32)
+        for name, shape in shapes(Evidence()).items()
+    }
+    return WeightFile("evidence", "residual", arrays)
+
+
+def _refiner(backend="auto"):
+    pytest.importorskip({"openvino": "openvino", "onnxruntime": "onnxruntime", "torch": "torch"}.get(backend, "numpy"))
+    return EvidenceRefiner.of(_weights(), backend=backend, precision="fp32")
+
+
+@pytest.mark.parametrize("backend", ["openvino", "onnxruntime"])
+def test_runtimes_agree_with_torch(backend):
+    disparity, candidates, confidence, left, right = _case(2, seed=8, rows=61, columns=75)
+    coarse = stereokit.Disparity(disparity, np.ones(disparity.shape, bool), confidence, candidates=candidates)
+    maps = [_refiner(name)(coarse, left, right=right).disparity for name in ("torch", backend)]
+    np.testing.assert_allclose(*maps, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1, 0.5, 0.25])
+@pytest.mark.parametrize(("low", "high"), [(0, 32), (-7, 9), (-33, -1), (5, 64)])
+def test_maps_stay_inside_the_range_at_any_scale(scale, low, high):
+    blank = np.full((35, 50), 90, np.uint8)
+    rng = np.random.default_rng(9)
+    noise = rng.integers(0, 256, (2, 35, 50), dtype=np.uint8)
+    refiner = _refiner()
+    matcher = stereokit.Matcher(
+        "S2", min_disparity=low, max_disparity=high, scale=scale, refiner=refiner, device="cpu", confidence=True
+    )
+    for left, right in ((blank, blank), noise):
+        found = matcher(left, right)
+        assert found.disparity.shape == (35, 50)
+        assert np.isfinite(found.disparity).all()
+        assert found.disparity.min() >= low
+        assert found.disparity.max() <= high - 1
+        assert found.confidence is not None
+        assert 0 <= found.confidence.min() <= found.confidence.max() <= 1
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.25])
+@pytest.mark.parametrize("low", [-7, 5])
+def test_linear_maps_of_odd_ranges_stay_inside_too(scale, low):
+    noise = np.random.default_rng(10).integers(0, 256, (2, 35, 50), dtype=np.uint8)
+    found = stereokit.match(*noise, "S2", min_disparity=low, max_disparity=low + 14, scale=scale, device="cpu")
+    assert low <= found.min()
+    assert found.max() <= low + 13
+
+
+def test_gaps_stay_gaps_and_neighbours_are_as_if_filled():
+    noise = np.random.default_rng(11).integers(0, 256, (2, 40, 60), dtype=np.uint8)
+    found = stereokit.Matcher("S2", max_disparity=32, scale=0.5, refiner=_refiner(), fill=None, device="cpu")(*noise)
+    gaps = np.isnan(found.disparity)
+    assert gaps.any()
+    assert not gaps.all()
+    assert not found.valid[gaps].any()
+
+
+def test_grey_level_and_gain_change_little():
+    """Census costs do not change at all under gain and offset; grey levels are normalised by their surroundings."""
+    disparity, candidates, confidence, left, right = _case(2, seed=12, rows=64, columns=96)
+    dark = [(image // 2 + 10).astype(np.uint8) for image in (left, right)]
+    doubled = [((image - 10) * 2).astype(np.uint8) for image in dark]
+    found = [hypotheses(disparity, candidates, *pair, 2) for pair in (dark, doubled)]
+    np.testing.assert_array_equal(found[0].costs, found[1].costs)
+    inputs = [network_input(f, confidence, pair[0], 96) for f, pair in zip(found, (dark, doubled), strict=True)]
+    grey = slice(0, CHANNELS["grey"])
+    assert np.abs(inputs[0][grey] - inputs[1][grey]).max() < 0.15
+    np.testing.assert_array_equal(inputs[0][16:], inputs[1][16:])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scale": 0.25}, "coarse map must be a quarter of the size of left"),
+        ({"right": np.zeros((5, 5), np.uint8)}, "right must have the size of left"),
+    ],
+)
+def test_what_does_not_fit_is_refused(change, message):
+    disparity, candidates, confidence, left, right = _case(2, seed=13)
+    coarse = stereokit.Disparity(disparity, np.ones(disparity.shape, bool), confidence, candidates=candidates)
+    with pytest.raises(OptionError, match=message):
+        _refiner()(coarse, left, **{"right": right, **change})
+
+
+def test_other_networks_refuse_other_scales():
+    with pytest.raises(OptionError, match=r"refiner 'stereovae' needs scale=0.5, got scale=0.25"):
+        stereokit.Matcher("S2", scale=0.25, refiner="stereovae", device="cpu")

@@ -1,0 +1,109 @@
+"""Pairs that are not what they should be: one warning, in Python and to who collects it; good pairs have none."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+
+import stereokit
+from stereokit.checks import doubts, doubts_about_density, low_density, same_pixels
+from stereokit.errors import StereokitWarning
+from stereokit.notices import PairWarning, collecting, warn
+from stereokit.result import Disparity
+
+NOISE = cv2.GaussianBlur(np.random.default_rng(0).normal(128, 90, (60, 700)), (0, 0), 0.8)
+TEXTURE = NOISE.clip(0, 255).astype(np.uint8)
+LEFT, RIGHT = TEXTURE[:, 100:400], TEXTURE[:, 112:412]  # disparity 12
+OPTIONS = {"max_disparity": 128}
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    return stereokit.Matcher("S2", **OPTIONS)
+
+
+def test_a_good_pair_has_no_warning(matcher):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert matcher(LEFT, RIGHT).density > 0.6
+        assert len(list(matcher.map([(LEFT, RIGHT)] * 3))) == 3
+        stereokit.warmup("S2", max_disparity=128)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "words"),
+    [
+        (RIGHT, LEFT, "exchanged"),
+        (LEFT, np.roll(RIGHT, 9, axis=0), "rows not aligned"),
+        (LEFT, TEXTURE[:, 350:650], r"outside of 0 \.\. 127"),
+        (LEFT, LEFT, "same pixels"),
+        (LEFT.astype(np.float32), LEFT.astype(np.float32).copy(), "same pixels"),
+    ],
+)
+def test_a_bad_pair_has_one_warning(matcher, left, right, words):
+    with pytest.warns(PairWarning, match=words) as caught:
+        matcher(left, right)
+    assert len(caught) == 1 and len(str(caught[0].message).splitlines()) == 1
+    assert caught[0].filename == __file__  # where the package was called
+    with pytest.warns(PairWarning, match=words):
+        stereokit.match(left, right, "S2", **OPTIONS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with collecting() as lines:
+            matcher(left, right)
+            matcher(left, right)
+    assert len(lines) == 1
+
+
+def test_a_sequence_is_warned_of_once(matcher):
+    with pytest.warns(PairWarning, match="pair 1: only") as caught:
+        list(matcher.map([(LEFT, RIGHT), (RIGHT, LEFT), (RIGHT, LEFT)]))
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize(("left", "right", "words"), [(RIGHT, LEFT, "only"), (LEFT, LEFT, "same pixels")])
+def test_large_pairs_are_warned_of(left, right, words, tmp_path):
+    with pytest.warns(PairWarning, match=words) as caught:
+        stereokit.match_large(left, right, tmp_path / "map.npy", "S2", **OPTIONS)
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        stereokit.match_large(LEFT, RIGHT, tmp_path / "map.npy", "S2", **OPTIONS)
+
+
+def test_density_decides():
+    assert [low_density(levels) for levels in (2048, 128, 64, 32, 16, 8, 1)] == [0.3, 0.3, 0.35, 0.4, 0.45, 0.45, 0.45]
+    for measured, number in ((0, "0.0 %"), (9, "9.0 %"), (34, "34 %"), (35, None), (100, None)):
+        valid = (np.arange(100) < measured).reshape(10, 10)
+        found = Disparity(np.zeros((10, 10), np.float32), valid)
+        lines = doubts(LEFT, RIGHT, found, -4, 60)
+        assert lines == doubts_about_density(measured / 100, -4, 60)
+        assert (not lines) if number is None else (f"only {number}" in lines[0] and "-4 .. 59" in lines[0])
+
+
+def test_same_pixels():
+    other = LEFT.copy()
+    other[-1, -1] ^= 1
+    assert same_pixels(LEFT, LEFT.copy()) and not same_pixels(LEFT, other)
+    assert not same_pixels(LEFT, LEFT[:, :-1])
+
+
+def test_warnings_go_to_who_collects_in_this_thread():
+    with collecting() as outer:
+        warn("one")
+        with collecting() as inner:
+            warn("two")
+            warn("two")
+        warn("three")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            thread = threading.Thread(target=warn, args=("of another thread",))
+            thread.start()
+            thread.join()
+    assert (outer, inner) == (["one", "three"], ["two"])
+    assert [(str(w.message), w.category) for w in caught] == [("of another thread", StereokitWarning)]
+    assert stereokit.PairWarning is PairWarning and issubclass(PairWarning, stereokit.StereokitWarning)

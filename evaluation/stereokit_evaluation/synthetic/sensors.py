@@ -65,7 +65,7 @@ def draw_sensors(rng: Rng, harsh: float) -> tuple[Sensor, Sensor]:
     shot, read = 10 ** rng.uniform(-4.6, -3.8 + 0.9 * harsh), 10 ** rng.uniform(-3.0, -2.5 + 0.6 * harsh)
     resample = float(rng.choice([0.0, rng.uniform(0.3, 0.6)], p=[0.45, 0.55]))
     vignette = rng.uniform(0, 0.15 + 0.3 * harsh)
-    exposure = float(0.45 ** (1 / gamma) * np.exp(rng.normal(0.0, 0.2 + 0.3 * harsh)))
+    exposure = float(0.45 ** (1 / gamma) * np.exp(np.clip(rng.normal(0.0, 0.2 + 0.3 * harsh), -0.9, 0.7)))
     contrast = float(np.clip(np.exp(rng.normal(0.0, 0.15)), 0.4, 1.3)) * (
         rng.uniform(0.35, 0.8) if rng.random() < 0.15 else 1
     )

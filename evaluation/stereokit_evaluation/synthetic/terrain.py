@@ -36,7 +36,7 @@ def terrain(stage: Stage) -> None:
     """Fill `stage` with a landscape or a town of about 100 units across, seen from above."""
     rng = stage.rng
     town = rng.random() < 0.65
-    stage.plain = float(rng.choice([0.05, 0.2, 0.4]))
+    stage.plain = float(rng.choice([0.1, 0.3, 0.5]))
     stage.field_of_view = float(rng.uniform(0.08, 0.5))
     far = 50 / np.tan(stage.field_of_view / 2)
     tilt = float(rng.normal(0, 0.12))
@@ -147,10 +147,10 @@ def terrain(stage: Stage) -> None:
         "around_level": 3.0,
         "around_gain": 1.0,
     }
-    if rng.random() < 0.6:  # taken at another time
+    if rng.random() < 0.75:  # taken at another time
         amount = float(rng.choice([0.05, 0.3, 0.8]))
         stage.later = {f"sun_{axis}": stage.light[f"sun_{axis}"] + float(rng.normal(0, amount)) for axis in "xz"}
-        stage.fickle = float(rng.choice([0.0, 0.15, 0.35]))
+        stage.fickle = float(rng.choice([0.1, 0.25, 0.45]))
         stage.later["sun"] = stage.light["sun"] * float(np.exp(rng.normal(0, 0.3)))
     if rng.random() < 0.85:
         stage.shadows, stage.shadow_centre = 80.0, np.zeros(3)

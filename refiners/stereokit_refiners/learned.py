@@ -187,26 +187,18 @@ class LearnedRefiner:
             raise OptionError(f"coarse map must be {size} size of left {left.shape}, got {coarse.disparity.shape}")
         if self.any_scale:
             return self._weighed(coarse, left, right, step, threads)
-        network = network_named(self._file.network)
         rows, columns = left.shape
-        height, width = coarse.disparity.shape
         disparity = coarse.disparity
         unknown = np.isnan(disparity)
         gaps = bool(unknown.any())
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
-        below, beside = -height % network.multiple, -width % network.multiple
         candidates = coarse.candidates if self.needs_candidates else None
         given = [disparity] if candidates is None else [disparity, candidates]
         shift = base_of(given)  # whole, so that float32 holds it
         self._check_trained(disparity, shift)
-        disparity = _extended((disparity - shift) * np.float32(2), below, beside)
-        confidence = None if coarse.confidence is None else _extended(coarse.confidence, below, beside)
-        image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
-        two = None if candidates is None else _extended_each((candidates - shift) * np.float32(2), below, beside)
-        inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
-        head = self._compiled.run(inputs, threads)
-        full = compose(self._file.network, self._file.form, head, disparity, rows, columns, threads, two)
+        lowered = None if candidates is None else candidates - shift
+        full = self.network_map(disparity - shift, lowered, coarse.confidence, left, threads)
         if shift != 0:
             full += 2 * shift
         np.clip(full, 2 * min(a.min() for a in given), 2 * max(a.max() for a in given), out=full)
@@ -217,6 +209,45 @@ class LearnedRefiner:
             known &= ~missing
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
+
+    def network_map(
+        self, disparity: NDArray[np.float32], candidates: NDArray[np.float32] | None,
+        confidence: NDArray[np.float32] | None, left: NDArray[Any], threads: int = 1,
+    ) -> NDArray[np.float32]:  # fmt: skip
+        """Return what the network itself makes of a half-size map, as exported graphs do.
+
+        The map is neither lowered before nor held to a range after.
+
+        Parameters
+        ----------
+        disparity : (h, w) float32
+            Half-size pixels, without NaN.
+        candidates : (2, h, w) float32 or None
+            Half-size pixels; only for networks that look at them.
+        confidence : (h, w) float32 or None
+            0 to 1; only for networks that look at it.
+        left : (H, W) uint8
+            Full-size image.
+        threads : int
+
+        Returns
+        -------
+        (H, W) float32, pixels
+        """
+        network = network_named(self._file.network)
+        rows, columns = left.shape
+        height, width = disparity.shape
+        below, beside = -height % network.multiple, -width % network.multiple
+        disparity = _extended(disparity * np.float32(2), below, beside)
+        confidence = None if confidence is None else _extended(confidence, below, beside)
+        image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
+        two = None if candidates is None else _extended_each(candidates * np.float32(2), below, beside)
+        inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
+        head = self._compiled.run(inputs, threads)
+        full: NDArray[np.float32] = compose(
+            self._file.network, self._file.form, head, disparity, rows, columns, threads, two
+        )
+        return full
 
     def _check_trained(self, disparity: NDArray[np.float32], shift: float) -> None:
         """Warn, once, where a map in half-size pixels, lowered by `shift`, goes beyond what was trained."""

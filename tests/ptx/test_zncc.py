@@ -9,7 +9,7 @@ from ptx import bodies_costs as bodies
 from ptx.emulated import EmulatedQueue
 from stereokit.costs import Zncc
 from stereokit.costs.rows import Levels
-from stereokit.costs.zncc_cuda import LARGEST_WINDOW, check_window
+from stereokit.costs.zncc_cuda import LARGEST_WINDOW, check
 from stereokit.errors import DeviceError
 
 
@@ -44,4 +44,4 @@ def test_windows_of_larger_images_take_the_range_of_the_whole():
 
 def test_a_window_that_no_register_holds_is_refused():
     with pytest.raises(DeviceError, match="window of zncc must be at most 11 on device 'cuda', got 13"):
-        check_window(Zncc(13))
+        check(Zncc(13))

@@ -87,3 +87,9 @@ def one_line(error):
     text = str(error)
     assert text and "\n" not in text, text
     return text
+
+
+def network_map(refiner, coarse, left, threads=1):
+    """Return what the network itself makes of a coarse map, neither lowered nor held to a range."""
+    candidates = coarse.candidates if refiner.needs_candidates else None
+    return refiner.network_map(coarse.disparity, candidates, coarse.confidence, left, threads)

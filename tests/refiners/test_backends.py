@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import oracles
 import pytest
-from refining import NAMES, coarse_of, encoded_of, image_of, needs_backend, random_arrays, random_content
+from refining import NAMES, coarse_of, encoded_of, image_of, needs_backend, network_map, random_arrays, random_content
 
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import NETWORKS
@@ -23,7 +23,7 @@ FORMS = [(name, "residual") for name in NAMES] + [("stereovae", "literal"), ("cn
 def refined(content, backend, precision="fp32", threads=1, size=SIZE):
     pytest.importorskip(backend)
     refiner = LearnedRefiner.of(content, backend=backend, precision=precision)
-    return refiner(coarse_of(size), image_of(size), threads=threads).disparity
+    return network_map(refiner, coarse_of(size), image_of(size), threads)
 
 
 def calibrated(name, seed=0):

@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from refining import NAMES, coarse_of, flat_ranges, half_of, image_of, random_content, weight_file
+from refining import NAMES, coarse_of, flat_ranges, half_of, image_of, network_map, random_content, weight_file
 from typer.testing import CliRunner
 
 from stereokit import Disparity
@@ -44,7 +44,7 @@ def feeds(content, size):
     given["candidates"] = coarse.candidates
     for name in {"confidence", "candidates"} - NETWORKS[content.network].inputs.keys():
         del given[name]
-    refined = LearnedRefiner.of(content, precision="fp32")(coarse, left).disparity
+    refined = network_map(LearnedRefiner.of(content, precision="fp32"), coarse, left)
     return {name: array.reshape(1, -1, *array.shape[-2:]) for name, array in given.items()}, refined
 
 
@@ -265,9 +265,8 @@ def test_exported_graphs_take_maps_without_gaps_only_as_documented():
         given = {"coarse": coarse.disparity, "confidence": confidence, "left": left.astype(np.float32)}
         given["candidates"] = coarse.candidates
         maps.append(session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in given.items()})[0][0, 0])
-        refined = LearnedRefiner.of(content, precision="fp32")(
-            Disparity(coarse.disparity, confidence > 0, confidence, candidates=coarse.candidates), left
-        )
-        np.testing.assert_allclose(maps[-1], refined.disparity, rtol=0, atol=module.TOLERANCE_PX)
+        seen = Disparity(coarse.disparity, confidence > 0, confidence, candidates=coarse.candidates)
+        refined = network_map(LearnedRefiner.of(content, precision="fp32"), seen, left)
+        np.testing.assert_allclose(maps[-1], refined, rtol=0, atol=module.TOLERANCE_PX)
     for one, other in itertools.combinations(maps, 2):
         assert np.abs(one - other).max() > 0.01

@@ -113,7 +113,8 @@ def largest_difference(content: WeightFile, model: bytes) -> float:
 
 def _reference(content: WeightFile, coarse: Disparity, left: NDArray[np.uint8]) -> NDArray[np.float32]:
     refiner = LearnedRefiner.of(content, backend="auto", precision="fp32")
-    return refiner(coarse, left).disparity
+    candidates = coarse.candidates if refiner.needs_candidates else None
+    return refiner.network_map(coarse.disparity, candidates, coarse.confidence, left)
 
 
 def _write_openvino(model: bytes, output: Path) -> None:

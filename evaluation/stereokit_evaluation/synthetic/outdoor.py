@@ -178,7 +178,13 @@ def garden(stage: Stage) -> None:
     if rng.random() < 0.6:
         for _ in range(int(rng.integers(1, 4))):
             x, z = spot(5.0)
-            front(stage, float(rng.uniform(3, 15)), float(rng.uniform(1.5, 8)), on(x, z), float(rng.normal(0, 0.6)))
+            front(
+                stage,
+                float(rng.uniform(3, min(15.0, z))),
+                float(rng.uniform(1.5, 8)),
+                on(x, z),
+                float(rng.normal(0, 0.6)),
+            )
     if rng.random() < 0.6:
         hedge(stage, np.array([-deep, 0.5, deep]), np.array([deep, 0.5, deep]), float(rng.uniform(2, 8)))
     for _ in range(int(rng.integers(0, 14))):

@@ -131,9 +131,9 @@ def test_values_and_costs_are_those_of_plain_loops(step):
     np.testing.assert_array_equal(found.others + found.base, others)
     np.testing.assert_array_equal(found.costs, costs)
     np.testing.assert_array_equal(found.outside, outside)
+    np.testing.assert_array_equal(found.near, _mean(found.costs[0].astype(int), 3))
     for k in (0, 4):
-        np.testing.assert_array_equal(found.small[k], _mean(found.costs[k].astype(int), 3))
-        np.testing.assert_array_equal(found.large[k], _mean(found.costs[k].astype(int), 7))
+        np.testing.assert_array_equal(found.around[k], _mean(found.costs[k].astype(int), 7))
 
 
 def _plain_input(found, confidence, left, columns):
@@ -181,7 +181,7 @@ def _plain_input(found, confidence, left, columns):
         column += by_two(lambda v, u: squash(half[v, u] - around(means["coarse"], y, x, 8), 8))  # noqa: B023
         for k in range(4):
             column += by_two(lambda v, u: squash(found.others[k, v, u] - half[v, u], 2))  # noqa: B023
-        column += by_two(lambda v, u: block(found.small[0], v, u, 2).mean() / 32 - 1)
+        column += by_two(lambda v, u: block(found.near, v, u, 2).mean() / 32 - 1)
         for k in range(1, 7):
             less = found.costs[0].astype(float) - found.costs[k]
             column += by_two(lambda v, u: block(less, v, u, 2).mean() / 32)  # noqa: B023
@@ -206,17 +206,15 @@ def _head(rng, found, scale=2.0):
 
 
 def _plain_mixture(head, found, y, x):
-    cell, phase = head[y // 4, x // 4].astype(np.float64), 4 * (y % 4) + x % 4
+    cell, part = head[y // 4, x // 4].astype(np.float64), 2 * (y % 4 // 2) + x % 4 // 2
     b = float(found.coarse[y, x])
     values = [b, b - found.apart, b + found.apart, *(float(found.others[k, y // 2, x // 2]) for k in range(4))]
     weights = [1.0]
     for k in range(1, 7):
-        logit = cell[16 * (k - 1) + phase]
-        for plane, first in ((found.small, LOGITS), (found.large, LOGITS + 2)):
-            evidence = np.clip(int(plane[0, y, x]) - int(plane[k, y, x]), -127, 127)
-            logit += cell[first + (k > 2)] * evidence / 16
+        less = np.clip(int(found.around[0, y, x]) - int(found.around[k, y, x]), -127, 127)
+        logit = cell[4 * (k - 1) + part] + cell[LOGITS + (k > 2)] * less / 16
         weights.append(math.exp(min(max(logit, -40), 40)))
-    sure = cell[LOGITS + GAINS + 2 * (y % 4 // 2) + x % 4 // 2]
+    sure = cell[LOGITS + GAINS + part]
     return found.base + np.dot(weights, values) / sum(weights), 1 / (1 + math.exp(-sure))
 
 
@@ -243,7 +241,7 @@ def test_a_head_that_refuses_all_others_leaves_the_upscaled_map():
 def test_threads_change_nothing(step):
     disparity, candidates, confidence, left, right = _case(step, seed=5, rows=70, columns=90)
     one, three = (hypotheses(disparity, candidates, left, right, step, threads) for threads in (1, 3))
-    for name in ("coarse", "others", "costs", "small", "large", "outside"):
+    for name in ("coarse", "others", "costs", "near", "around", "outside"):
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
     inputs = [network_input(one, confidence, left, 90, threads) for threads in (1, 3)]
     np.testing.assert_array_equal(*inputs)

@@ -39,12 +39,12 @@ CHANNELS = {
 }
 """Channels of the network's input, at a quarter of the size."""
 
-LOGITS = 16 * (len(VALUES) - 1)
-"""Channels of the head that are logits: value by value, each by pixel of the 4x4."""
+LOGITS = 4 * (len(VALUES) - 1)
+"""Channels of the head that are logits: value by value, each by 2x2 of the 4x4."""
 
-GAINS = 4
-"""Then come gains: of the small window for "less" and "more", for the others, and the same of the large window; and
-last four logits of how sure the result is, by 2x2 of the 4x4."""
+GAINS = 2
+"""Then come the gains of the evidence, for "less" and "more" and for the others; and last four logits of how sure the
+result is, by 2x2 of the 4x4."""
 
 _A, _B, _C, _D = 16, 32, 48, 64
 
@@ -73,6 +73,7 @@ class Evidence:
     )
     inputs: ClassVar[dict[str, int]] = {"evidence": sum(CHANNELS.values())}
     multiple: ClassVar[int] = 8
+    innermost: ClassVar[bool] = True
     forms: ClassVar[tuple[str, ...]] = ("residual",)
     latent: ClassVar[bool] = False
 

@@ -108,6 +108,10 @@ class Network(Protocol):
         """Rows and columns of the input must be multiples of this."""
 
     @property
+    def innermost(self) -> bool:
+        """Whether inputs come with their channels innermost in memory."""
+
+    @property
     def forms(self) -> tuple[str, ...]:
         """Which of `stereokit_refiners.runtimes.encode.FORMS` it has."""
 

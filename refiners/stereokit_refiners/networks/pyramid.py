@@ -61,6 +61,7 @@ class Pyramid:
     )
     inputs: ClassVar[dict[str, int]] = {"disparity": 1, "confidence": 1, "phases": 4, "candidates": 2}
     multiple: ClassVar[int] = 8
+    innermost: ClassVar[bool] = False
     forms: ClassVar[tuple[str, ...]] = ("residual",)
     latent: ClassVar[bool] = False
 

@@ -51,6 +51,7 @@ class StereoVae:
     layers: ClassVar[tuple[Layer, ...]] = _table(latent=True)
     inputs: ClassVar[dict[str, int]] = {"disparity": 1, "image": 1}
     multiple: ClassVar[int] = 4
+    innermost: ClassVar[bool] = False
     forms: ClassVar[tuple[str, ...]] = ("residual", "literal")
     latent: ClassVar[bool] = True
 

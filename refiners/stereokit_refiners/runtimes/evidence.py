@@ -48,8 +48,10 @@ class Hypotheses:
         Lowest and highest nearby, candidate and rival, for each 2x2 pixels.
     costs : (7, H, W) uint8
         Of each of `VALUES`, eighths of a bit.
-    small, large : (7, H, W) uint8
-        The means of `costs` over a small and a large window.
+    near : (H, W) uint8
+        The mean of the coarse map's costs over 3x3.
+    around : (7, H, W) uint8
+        The means of all costs over 7x7.
     outside : (H, W) uint8
         1 where the coarse map points outside the right image.
     """
@@ -59,8 +61,8 @@ class Hypotheses:
     coarse: NDArray[np.float32]
     others: NDArray[np.float32]
     costs: NDArray[np.uint8]
-    small: NDArray[np.uint8]
-    large: NDArray[np.uint8]
+    near: NDArray[np.uint8]
+    around: NDArray[np.uint8]
     outside: NDArray[np.uint8]
 
     @property
@@ -123,9 +125,9 @@ def hypotheses(
     extremes = [np.asarray(pick(near, window), np.float32) for pick in (cv2.erode, cv2.dilate)]
     others = np.stack([on_half_grid(one, step) for one in (*extremes, *map(relative, candidates))])
     base = lowest * step
-    costs, small, large = (np.empty((len(VALUES), height, width), np.uint8) for _ in range(3))
-    outside = np.empty((height, width), np.uint8)
-    found = Hypotheses(base, step, coarse, others, costs, small, large, outside)
+    costs, around = (np.empty((len(VALUES), height, width), np.uint8) for _ in range(2))
+    near_costs, outside = (np.empty((height, width), np.uint8) for _ in range(2))
+    found = Hypotheses(base, step, coarse, others, costs, near_costs, around, outside)
     mine, theirs = (_census_of(extended(image, height, width), threads) for image in (left, right))
     parts = spans(height, threads)
     lines = [np.empty((6, width), np.int32) for _ in parts]
@@ -138,14 +140,8 @@ def hypotheses(
         ],
         threads,
     )  # fmt: skip
-    run(
-        [
-            partial(_mean, costs[k], side, out[k])
-            for side, out in ((_SMALL, small), (_LARGE, large))
-            for k in range(len(VALUES))
-        ],
-        threads,
-    )
+    means = [partial(_mean, costs[k], _LARGE, around[k]) for k in range(len(VALUES))]
+    run([*means, partial(_mean, costs[0], _SMALL, near_costs)], threads)
     return found
 
 
@@ -284,11 +280,12 @@ def network_input(
 
     Returns
     -------
-    (C, H/4, W/4) float32
+    (C, H/4, W/4) float32, channels innermost in memory
     """
     height, width = found.coarse.shape
     quarter = (height // 4, width // 4)
-    out = np.empty((sum(CHANNELS.values()), *quarter), np.float32)
+    channels = sum(CHANNELS.values())
+    out = np.empty((*quarter, channels), np.float32)
     sure = on_half_grid(extended(confidence, height // found.step, width // found.step), found.step)
     image = extended(left, height, width)
     half = np.empty((height // 2, width // 2), np.float32)
@@ -309,17 +306,18 @@ def network_input(
         threads,
     )
     scale = np.float32({1: -1, 2: 0, 4: 1}[found.step])
+    planes = np.empty((len(parts), channels, quarter[1]), np.float32)
     run(
         [
             partial(
-                _features, image, sure, half, found.others, means, found.costs, found.small, found.outside, surface,
-                scale, y0, y1, out,
+                _features, image, sure, half, found.others, means, found.costs, found.near, found.outside, surface,
+                scale, y0, y1, planes[k], out,
             )
-            for y0, y1 in parts
+            for k, (y0, y1) in enumerate(parts)
         ],
         threads,
     )  # fmt: skip
-    return out
+    return np.moveaxis(out, 2, 0)
 
 
 @kernel
@@ -422,10 +420,11 @@ def _squashed(x: Any, unit: Any) -> Any:
 @kernel
 def _features(
     image: NDArray[np.uint8], sure: NDArray[np.float32], half: NDArray[np.float32], others: NDArray[np.float32],
-    means: NDArray[np.float32], costs: NDArray[np.uint8], small: NDArray[np.uint8], outside: NDArray[np.uint8],
-    surface: NDArray[np.float32], scale: float, y0: int, y1: int, out: NDArray[np.float32],
+    means: NDArray[np.float32], costs: NDArray[np.uint8], near: NDArray[np.uint8], outside: NDArray[np.uint8],
+    surface: NDArray[np.float32], scale: float, y0: int, y1: int, plane: NDArray[np.float32],
+    out: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    width = out.shape[2]
+    width = out.shape[1]
     two = np.float32(2)
     for y in range(y0, y1):
         mean = means[0, y]
@@ -434,7 +433,7 @@ def _features(
         for i in range(4):
             line = image[4 * y + i]
             for j in range(4):
-                row = out[4 * i + j, y]
+                row = plane[4 * i + j]
                 for x in range(width):
                     level = (np.float32(line[4 * x + j]) - mean[x]) * inverse[x]
                     row[x] = min(max(level, np.float32(-3)), np.float32(3))
@@ -442,33 +441,33 @@ def _features(
             for j in range(2):
                 p = 2 * i + j
                 h = 2 * y + i
-                row = out[16 + p, y]
+                row = plane[16 + p]
                 line_f = sure[h]
                 for x in range(width):
                     row[x] = line_f[2 * x + j] * np.float32(4) - two
-                row = out[20 + p, y]
+                row = plane[20 + p]
                 here = half[h]
                 for x in range(width):
                     row[x] = _squashed(here[2 * x + j] - around[x], np.float32(8))
                 for k in range(4):
-                    row = out[24 + 4 * k + p, y]
+                    row = plane[24 + 4 * k + p]
                     line_f = others[k, h]
                     for x in range(width):
                         row[x] = _squashed(line_f[2 * x + j] - here[2 * x + j], two)
                 for k in range(5):
-                    row = out[70 + 4 * k + p, y]
+                    row = plane[70 + 4 * k + p]
                     line_f = surface[k, h]
                     for x in range(width):
                         row[x] = _squashed(line_f[2 * x + j], two)
                 upper = 2 * h
-                row = out[40 + p, y]
+                row = plane[40 + p]
                 for x in range(width):
                     c = 2 * x + j
-                    total = np.int32(small[0, upper, 2 * c]) + np.int32(small[0, upper, 2 * c + 1])
-                    total += np.int32(small[0, upper + 1, 2 * c]) + np.int32(small[0, upper + 1, 2 * c + 1])
+                    total = np.int32(near[upper, 2 * c]) + np.int32(near[upper, 2 * c + 1])
+                    total += np.int32(near[upper + 1, 2 * c]) + np.int32(near[upper + 1, 2 * c + 1])
                     row[x] = np.float32(total) * np.float32(1 / 128) - np.float32(1)
                 for k in range(1, 7):
-                    row = out[40 + 4 * k + p, y]
+                    row = plane[40 + 4 * k + p]
                     for x in range(width):
                         c = 2 * (2 * x + j)
                         total = np.int32(costs[0, upper, c]) + np.int32(costs[0, upper, c + 1])
@@ -476,13 +475,17 @@ def _features(
                         total -= np.int32(costs[k, upper, c]) + np.int32(costs[k, upper, c + 1])
                         total -= np.int32(costs[k, upper + 1, c]) + np.int32(costs[k, upper + 1, c + 1])
                         row[x] = np.float32(total) * np.float32(1 / 128)
-        row = out[68, y]
+        row = plane[68]
         for x in range(width):
             total = np.int32(0)
             for i in range(4):
                 for j in range(4):
                     total += np.int32(outside[4 * y + i, 4 * x + j])
             row[x] = np.float32(total) * np.float32(1 / 16)
-        row = out[69, y]
+        row = plane[69]
         for x in range(width):
             row[x] = np.float32(scale)
+        for first in range(0, width, 16):  # pixels that fit into the nearest cache, channel by channel
+            for c in range(plane.shape[0]):
+                for x in range(first, min(first + 16, width)):
+                    out[y, x, c] = plane[c, x]

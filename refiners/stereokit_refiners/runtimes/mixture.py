@@ -42,11 +42,11 @@ def mixture(
     disparity = np.empty((rows, columns), np.float32)
     sure = np.empty((rows, columns), np.float32)
     parts = spans(-(-rows // 4), threads)
-    lines = [np.empty((8, found.coarse.shape[1]), np.float32) for _ in parts]
+    lines = [np.empty((15, found.coarse.shape[1]), np.float32) for _ in parts]
     run(
         [
             partial(
-                _mix, head, found.coarse, found.others, found.small, found.large, found.base, found.apart, y0, y1,
+                _mix, head, found.coarse, found.others, found.around, found.base, found.apart, y0, y1,
                 lines[k], disparity, sure,
             )
             for k, (y0, y1) in enumerate(parts)
@@ -74,66 +74,73 @@ def _exponential(x: Any) -> Any:
 
 @kernel
 def _mix(
-    head: NDArray[np.float32], coarse: NDArray[np.float32], others: NDArray[np.float32], small: NDArray[np.uint8],
-    large: NDArray[np.uint8], base: int, apart: float, y0: int, y1: int, lines: NDArray[np.float32],
-    disparity: NDArray[np.float32], sure: NDArray[np.float32],
+    head: NDArray[np.float32], coarse: NDArray[np.float32], others: NDArray[np.float32], around: NDArray[np.uint8],
+    base: int, apart: float, y0: int, y1: int, lines: NDArray[np.float32], disparity: NDArray[np.float32],
+    sure: NDArray[np.float32],
 ) -> None:  # fmt: skip
     rows, columns = disparity.shape
     width = coarse.shape[1]
-    sixteenth = np.float32(1 / 16)
     low = np.int32(-127)
     high = np.int32(127)
-    logit = lines[0]
-    value = lines[1]
+    step = np.float32(apart)
+    gains = lines[:2]
     above = lines[2]
     below = lines[3]
-    gains = lines[4:]
+    certain = lines[4]
+    logits = lines[5:11]
+    values = lines[11:]
     for y in range(y0, y1):
         pixels = head[y]
         for x in range(width // 4):
-            for g in range(4):
-                gain = pixels[x, LOGITS + g] * sixteenth
+            for g in range(GAINS):
+                gain = pixels[x, LOGITS + g] * np.float32(1 / 16)
                 for j in range(4):
                     gains[g, 4 * x + j] = gain
-        for i in range(min(4, rows - 4 * y)):
-            r = 4 * y + i
-            line = coarse[r]
-            first = small[0, r]
-            third = large[0, r]
+        for i in range(2):
+            for x in range(width // 4):  # each logit stands for two columns, and for two rows
+                for k in range(6):
+                    for j in range(2):
+                        logit = pixels[x, 4 * k + 2 * i + j]
+                        logits[k, 4 * x + 2 * j] = logit
+                        logits[k, 4 * x + 2 * j + 1] = logit
+                for j in range(2):
+                    logit = -pixels[x, LOGITS + GAINS + 2 * i + j]
+                    certain[4 * x + 2 * j] = logit
+                    certain[4 * x + 2 * j + 1] = logit
             for x in range(width):
-                above[x] = np.float32(0)
-                below[x] = np.float32(1)
-            for k in range(6):
-                second = small[k + 1, r]
-                fourth = large[k + 1, r]
-                near = gains[0 if k < 2 else 1]
-                far = gains[2 if k < 2 else 3]
-                for x in range(width // 4):
-                    for j in range(4):
-                        logit[4 * x + j] = pixels[x, 16 * k + 4 * i + j]
-                if k >= 2:
-                    other = others[k - 2, r >> 1]
-                    for x in range(width // 2):
-                        value[2 * x] = other[x] - line[2 * x]
-                        value[2 * x + 1] = other[x] - line[2 * x + 1]
-                else:
-                    for x in range(width):
-                        value[x] = np.float32(apart) if k == 1 else -np.float32(apart)
+                certain[x] = np.float32(1) / (np.float32(1) + _exponential(certain[x]))
+            for k in range(4):
+                other = others[k, 2 * y + i]
+                for x in range(width // 2):
+                    values[k, 2 * x] = other[x]
+                    values[k, 2 * x + 1] = other[x]
+            for r in range(4 * y + 2 * i, min(4 * y + 2 * i + 2, rows)):
+                line = coarse[r]
+                mine = around[0, r]
                 for x in range(width):
-                    a = min(max(np.int32(first[x]) - np.int32(second[x]), low), high)
-                    b = min(max(np.int32(third[x]) - np.int32(fourth[x]), low), high)
-                    logit[x] += np.float32(a) * near[x] + np.float32(b) * far[x]
-                for x in range(width):
-                    weight = _exponential(logit[x])
-                    above[x] += weight * value[x]
-                    below[x] += weight
-            out = disparity[r]
-            for x in range(columns):
-                out[x] = line[x] + above[x] / below[x] + np.float32(base)
-            for x in range(width // 2):
-                logit[x] = -pixels[x >> 1, LOGITS + GAINS + 2 * (i >> 1) + (x & 1)]
-            for x in range(width // 2):
-                logit[x] = np.float32(1) / (np.float32(1) + _exponential(logit[x]))
-            out = sure[r]
-            for x in range(columns):
-                out[x] = logit[x >> 1]
+                    above[x] = np.float32(0)
+                    below[x] = np.float32(1)
+                for k in range(6):
+                    cost = around[k + 1, r]
+                    prior = logits[k]
+                    gain = gains[0 if k < 2 else 1]
+                    if k < 2:
+                        value = step if k == 1 else -step
+                        for x in range(width):
+                            less = min(max(np.int32(mine[x]) - np.int32(cost[x]), low), high)
+                            weight = _exponential(prior[x] + np.float32(less) * gain[x])
+                            above[x] += weight * value
+                            below[x] += weight
+                    else:
+                        other = values[k - 2]
+                        for x in range(width):
+                            less = min(max(np.int32(mine[x]) - np.int32(cost[x]), low), high)
+                            weight = _exponential(prior[x] + np.float32(less) * gain[x])
+                            above[x] += weight * (other[x] - line[x])
+                            below[x] += weight
+                out = disparity[r]
+                for x in range(columns):
+                    out[x] = line[x] + above[x] / below[x] + np.float32(base)
+                out = sure[r]
+                for x in range(columns):
+                    out[x] = certain[x]

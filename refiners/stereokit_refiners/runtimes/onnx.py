@@ -194,7 +194,7 @@ def session(
     held = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
     def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        given = {name: inputs[name][None] for name in network.inputs}
+        given = {name: np.ascontiguousarray(inputs[name][None]) for name in network.inputs}
         return np.ascontiguousarray(held.run(["head"], given)[0][0])
 
     return run

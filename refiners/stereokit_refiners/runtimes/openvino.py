@@ -162,11 +162,13 @@ def build(network: Network, weights: Weights, rows: int, columns: int, ranges: R
         Largest absolute value of each channel of each activation, by name, for int8.
     """
     ops = _OpenVinoOps(network, weights, ranges or {})
-    inputs = {
-        name: op.parameter([1, channels, rows, columns], np.float32, name=name)
-        for name, channels in network.inputs.items()
-    }
-    head = network.forward(ops, inputs)["map"]
+    inputs, given = {}, {}
+    for name, channels in network.inputs.items():
+        size = [1, rows, columns, channels] if network.innermost else [1, channels, rows, columns]
+        inputs[name] = given[name] = op.parameter(size, np.float32, name=name)
+        if network.innermost:
+            given[name] = op.transpose(inputs[name], op.constant(np.array([0, 3, 1, 2], np.int64)))
+    head = network.forward(ops, given)["map"]
     head = op.transpose(head, op.constant(np.array([0, 2, 3, 1], np.int64)))  # the layout that it has in memory
     return ov.Model([op.result(head)], list(inputs.values()), network.name)
 
@@ -205,7 +207,10 @@ def compiled(
 
     def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
         with requests.take() as free:
-            free.infer([inputs[name][None] for name in network.inputs], share_inputs=True)
+            given = [inputs[name][None] for name in network.inputs]
+            if network.innermost:
+                given = [np.ascontiguousarray(np.moveaxis(each, 1, 3)) for each in given]
+            free.infer(given, share_inputs=True)
             return np.array(free.get_output_tensor().data[0])
 
     return run

@@ -39,8 +39,7 @@ _FIELDS: dict[str, tuple[int, Any]] = {
     "input": (sum(CHANNELS.values()), np.int8),
     "others": (16, np.float16),  # the last four values less the mean of the coarse map over 2x2
     "within": (16, np.float16),  # the coarse map less that mean, by pixel of the 4x4
-    "small": (LOGITS, np.int8),  # evidence over the small and over the large window
-    "large": (LOGITS, np.int8),
+    "gain": (4 * LOGITS, np.int8),  # how much less the other values cost, by pixel of the 4x4
     "miss": (16, np.float16),  # truth less coarse map
     "kind": (16, np.uint8),  # 0 truth unknown, 1 seen by both cameras, 2 by the left one only
 }
@@ -83,6 +82,11 @@ def unpacked(record: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     return found
 
 
+def _gains(means: NDArray[np.uint8]) -> NDArray[Any]:
+    gains = np.clip(means[:1].astype(np.int16) - means[1:], -127, 127)
+    return np.concatenate([_folded(gain, 4) for gain in gains])
+
+
 class _Keeper:
     """A refiner that keeps what it is given."""
 
@@ -100,7 +104,7 @@ def make_sample(
     method: str, scale: float, **options: Any,
 ) -> tuple[NDArray[np.uint8], float]:  # fmt: skip
     """Match a pair; return what the network sees and should make of it, and the coarse map's share of outliers."""
-    known = np.isfinite(truth)
+    known = np.isfinite(truth) & (truth > 0)  # 0 is the sky
     farthest = float(truth[known].max())
     keeper = _Keeper()
     levels = int(np.ceil((farthest + 8) / 32) * 32)
@@ -118,16 +122,11 @@ def make_sample(
     miss[: left.shape[0], : left.shape[1]] = np.where(known, truth - upscaled, 0)
     kind[: left.shape[0], : left.shape[1]] = np.where(known, np.where(seen, 1, 2), 0)
 
-    def evidence(means: NDArray[np.uint8]) -> NDArray[Any]:
-        gains = np.clip(means[:1].astype(np.int16) - means[1:], -127, 127)
-        return np.concatenate([_folded(gain, 4) for gain in gains])
-
     fields = {
         "input": network_input(found, coarse.confidence, left, left.shape[1]),
         "others": np.concatenate([_folded(values - half, 2) for values in found.others]),
         "within": _folded(found.coarse - half.repeat(2, 0).repeat(2, 1), 4),
-        "small": evidence(found.small),
-        "large": evidence(found.large),
+        "gain": _gains(found.around),
         "miss": _folded(miss, 4),
         "kind": _folded(kind, 4),
     }
@@ -190,28 +189,31 @@ def _store(pairs: Path, folder: Path, most: int) -> None:
 
 
 def mixture(
-    head: Tensor, others: Tensor, within: Tensor, small: Tensor, large: Tensor, apart: Tensor
+    head: Tensor, others: Tensor, within: Tensor, gain: Tensor, apart: Tensor
 ) -> Tensor:  # fmt: skip
     """Return the map less the coarse one, (B, 16, h, w): the twin of `stereokit_refiners.runtimes.mixture.mixture`.
 
     Parameters
     ----------
     head : (B, C, h, w)
-    others, within, small, large : (B, ., h, w)
+    others, within, gain : (B, ., h, w)
         As they are stored.
     apart : (B,)
         How far "less" and "more" are from the coarse map, pixels.
     """
     batch, _, height, width = head.shape
     count = len(VALUES) - 1
-    logits = head[:, :LOGITS].view(batch, count, 16, height, width)
+
+    def by_pixel(x: Tensor) -> Tensor:
+        """Each of 2x2 four times: (B, 4n, h, w) -> (B, n, 16, h, w)."""
+        wide = x.view(batch, -1, 2, 1, 2, 1, height, width).expand(-1, -1, -1, 2, -1, 2, -1, -1)
+        return wide.reshape(batch, -1, 16, height, width)
+
     gains = head[:, LOGITS : LOGITS + GAINS] / 16
-    for part, first in ((small, 0), (large, 2)):
-        gain = torch.stack([gains[:, first + (k >= 2)] for k in range(count)], 1)[:, :, None]
-        logits = logits + gain * part.view(batch, count, 16, height, width)
+    per_value = torch.stack([gains[:, int(k >= 2)] for k in range(count)], 1)[:, :, None]
+    logits = by_pixel(head[:, :LOGITS]) + per_value * gain.view(batch, count, 16, height, width)
     weights = logits.clamp(-40, 40).exp()
-    four = others.view(batch, 4, 2, 1, 2, 1, height, width).expand(-1, -1, -1, 2, -1, 2, -1, -1)
-    differences = four.reshape(batch, 4, 16, height, width) - within[:, None]
+    differences = by_pixel(others) - within[:, None]
     more = apart.view(batch, 1, 1, 1, 1).expand(batch, 1, 16, height, width)
     differences = torch.cat([-more, more, differences], 1)
     return (weights * differences).sum(1) / (1 + weights.sum(1))
@@ -225,8 +227,8 @@ def _badness(error: Tensor) -> Tensor:
 
 def loss(head: Tensor, fields: dict[str, Tensor], apart: Tensor) -> tuple[Tensor, Tensor]:
     """Return the loss, and that of the coarse map alone."""
-    given = {name: fields[name].float() for name in ("others", "within", "small", "large")}
-    out = mixture(head, given["others"], given["within"], given["small"], given["large"], apart)
+    given = {name: fields[name].float() for name in ("others", "within", "gain")}
+    out = mixture(head, given["others"], given["within"], given["gain"], apart)
     miss, kind = fields["miss"].float(), fields["kind"]
     weight = (kind == 1).float() + _OCCLUDED * (kind == 2).float()
     error = (out - miss).abs()
@@ -248,7 +250,7 @@ def _begun(module: Module) -> None:
     with torch.no_grad():
         bias = module.weights["head-bias"]
         bias[:LOGITS] = -3
-        bias[LOGITS : LOGITS + GAINS] = 0.3
+        bias[LOGITS : LOGITS + GAINS] = 0.15
 
 
 def _batches(folder: Path, batch: int, size: tuple[int, int], rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:

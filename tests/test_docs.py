@@ -239,8 +239,8 @@ def public_modules() -> set[str]:
 
 INTERNAL = re.compile(
     r"stereokit\.(kernels|cuda|images|methods|io\.|cli\.(?!app))"
-    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|compose|reference)"
-    r"|stereokit_evaluation\.(common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes))"
+    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|compose|reference|evidence|mixture)"
+    r"|stereokit_evaluation\.(common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes|generated))"
     r"|.*_cuda$"
 )
 """Modules that only this project uses."""

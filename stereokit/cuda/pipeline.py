@@ -18,7 +18,7 @@ import numpy as np
 
 from stereokit.costs.rows_cuda import Scene
 from stereokit.cuda.dry import DryQueue
-from stereokit.cuda.kernel import Queue, blocks_for, cuda
+from stereokit.cuda.kernel import KERNELS, Kernel, Queue, blocks_for, cuda
 from stereokit.cuda.stream import DeviceQueue, stream_of
 from stereokit.errors import DeviceError, InputError
 from stereokit.images.gray import GrayPair
@@ -26,11 +26,12 @@ from stereokit.images.prepare_cuda import flip, halve, smooth, take
 from stereokit.kernels.workspace import Pool
 from stereokit.pipeline import refined
 from stereokit.postprocess.chain_cuda import post_process, raise_to
+from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
 from stereokit.selection.wta_cuda import Maps, doubt
 from stereokit.settings import Detail, MatchSettings
 
-__all__ = ["CudaPipeline", "DeviceDisparity"]
+__all__ = ["CudaPipeline", "DeviceDisparity", "all_kernels"]
 
 Shape = tuple[int, int]
 
@@ -322,6 +323,16 @@ class CudaPipeline:
 def _floats(aggregation: Any) -> bool:
     """Return whether aggregated costs are floats."""
     return bool(np.dtype(aggregation.total_dtype).kind == "f")
+
+
+def all_kernels() -> dict[str, Kernel]:
+    """Return every CUDA kernel of this package by name: those of the twins of all stages that are registered."""
+    for registry in (COSTS, AGGREGATIONS):
+        for name in registry.names():
+            module = getattr(registry.get(name), "cuda", None)
+            if module is not None:
+                import_module(module)
+    return KERNELS
 
 
 def _twin(kind: str, stage: Any) -> Any:

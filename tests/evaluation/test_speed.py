@@ -390,7 +390,10 @@ def test_a_peer_that_fails_is_left_out_but_a_method_is_not(monkeypatch, one_peer
         (("--left", "none.png", "--right", "none.png"), "none.png"),
         (("--json", "no/such/folder.json"), "json 'no/such/folder.json'"),
         (("--runtimes", "cnn"), "runtimes must come with pipeline, got 'cnn' alone"),
-        (("--pipeline", "--runtimes", "linear"), "runtimes must be one of stereovae, cnn, stereokit, got 'linear'"),
+        (
+            ("--pipeline", "--runtimes", "linear"),
+            "runtimes must be one of stereovae, cnn, stereokit, evidence, got 'linear'",
+        ),
     ],
 )
 def test_bad_input_exits_with_2_and_one_line(words, said, monkeypatch):

@@ -37,10 +37,9 @@ def has_tools() -> bool:
 
 def kernels() -> dict[str, Any]:
     """Return every kernel of the project by name."""
-    import stereokit.cuda.pipeline  # noqa: F401 (its imports file the kernels)
-    from stereokit.cuda.kernel import KERNELS
+    from stereokit.cuda.pipeline import all_kernels
 
-    return KERNELS
+    return all_kernels()
 
 
 @cache

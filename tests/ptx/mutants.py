@@ -283,7 +283,7 @@ MUTANTS = [
     ),
     Mutant(
         "a thread past the last pixel looks for evidence", "postprocess.chain_cuda",
-        "if at < pixels and", "if at <= pixels and", _BOUNDS, "post.check_chain",
+        "if at < pixels and bad", "if at <= pixels and bad", _BOUNDS, "post.check_chain",
     ),
 ]  # fmt: skip
 

@@ -174,7 +174,7 @@ def refused(path):
     with pytest.raises(FileError) as caught:
         Shelf([path])[0]
     text = one_line(caught.value)
-    assert text.startswith("cache must hold samples of this program, cannot read ") and repr(str(path)) in text, text
+    assert text.startswith("cache must hold samples of this program, got ") and repr(str(path)) in text, text
     return text
 
 

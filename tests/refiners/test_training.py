@@ -13,7 +13,7 @@ import numpy as np
 import oracles
 import pytest
 from limits import HANG_S
-from refining import NAMES, network_map, one_line, random_arrays
+from refining import NAMES, one_line, random_arrays
 
 torch = pytest.importorskip("torch")
 
@@ -181,7 +181,7 @@ def test_predict_is_what_the_refiner_computes(name, form, size):
     refiner = LearnedRefiner.of(WeightFile(name, form, arrays), backend="torch")
     coarse = coarse_map(sample)
     image = np.ascontiguousarray(sample.left[: size[0], : size[1]])
-    np.testing.assert_allclose(found, network_map(refiner, coarse, image), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(found, refiner(coarse, image).disparity, rtol=0, atol=2e-3)
 
 
 def test_predict_leaves_the_module_as_it_was():

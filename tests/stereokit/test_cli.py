@@ -386,7 +386,7 @@ def test_importing_the_command_line_is_light():
 
 def test_paths_are_told_as_they_are(tmp_path, pair):
     for name in ("map[left].pfm", "a[/red].pfm", "[bold]x.pfm"):
-        (tmp_path / "a[").mkdir(exist_ok=True)
+        (tmp_path / "a[" / name).parent.mkdir(parents=True, exist_ok=True)
         result = run("match", *pair, "-o", tmp_path / "a[" / name)
         assert result.exit_code == 0, result.output
         assert name in "".join(result.stdout.replace("│", "").split())  # the table may break it

@@ -14,7 +14,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from torch import Tensor
 from stereokit.errors import OptionError
 from stereokit.io import make_folder, parsing, write_bytes
 from stereokit_refiners.networks.layers import Network, Weights
-from stereokit_refiners.runtimes.encode import check_form, encode
+from stereokit_refiners.runtimes.encode import base_of, check_form, encode
 from stereokit_refiners.runtimes.torch import Module, calibrate, compose
 from stereokit_refiners.training.losses import distance, divergence
 from stereokit_refiners.training.samples import Crop, Sample, Shelf, crop, whole
@@ -141,9 +141,16 @@ def _precision(device: torch.device, half: bool) -> Iterator[None]:
 
 
 def predict(module: Module, form: str, sample: Sample, *, half: bool = False) -> NDArray[np.float32]:
-    """Return the refined map of a whole sample, (H, W) float32 in full-size pixels."""
+    """Return the refined map of a whole sample, (H, W) float32 in full-size pixels, as the refiner makes it."""
     device = next(module.parameters()).device
     part = whole(sample, module.network.multiple)
+    height, width = sample.coarse.shape
+    given = [part.disparity[:height, :width]]
+    if "candidates" in module.network.inputs:
+        given.append(part.candidates[:, :height, :width])
+    shift = np.float32(2 * base_of([one / np.float32(2) for one in given]))  # half-size pixels, as the refiner's
+    low, high = min(one.min() for one in given), max(one.max() for one in given)
+    part = replace(part, disparity=part.disparity - shift, candidates=part.candidates - shift)
     batch = {name: tensor.to(device) for name, tensor in _batch(module.network, form, [part]).items()}
     training = module.training
     module.eval()
@@ -152,7 +159,8 @@ def predict(module: Module, form: str, sample: Sample, *, half: bool = False) ->
         full = compose(module.network.name, form, heads["map"], batch["coarse"], batch["values"])
     module.train(training)
     rows, columns = sample.size
-    return full[0, 0, :rows, :columns].float().cpu().numpy()
+    estimate: NDArray[np.float32] = full[0, 0, :rows, :columns].float().cpu().numpy() + shift
+    return np.clip(estimate, low, high)
 
 
 def bad_pixels(estimate: NDArray[np.float32], sample: Sample, *, occluded: bool = False) -> tuple[int, int]:

@@ -102,7 +102,7 @@ def test_loading_never_runs_code(tmp_path):
     [
         ({"format": "stereokit-refiner/3"}, ["stereokit-refiner/2", "stereokit-refiner/3"]),
         ({"format": ""}, ["format"]),
-        ({"network": "resnet"}, ["no network named 'resnet'", "cnn, stereokit, stereovae"]),
+        ({"network": "resnet"}, ["no network named 'resnet'", "cnn, evidence, stereokit, stereovae"]),
         ({"network": ""}, ["no network named ''"]),
         ({"network": "stereovae"}, ["weights must be those of 'stereovae'", "lacks 'D_1.bias'"]),
         ({"form": "printed"}, ["must be one of residual, literal", "'printed'"]),

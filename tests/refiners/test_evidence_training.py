@@ -94,7 +94,7 @@ def test_the_identity_costs_what_the_coarse_map_costs_and_harm_costs_more():
     fields = {name: torch.from_numpy(a[None]).permute(0, 3, 1, 2) for name, a in _fields()[0].items()}
     head = torch.zeros(1, LOGITS + GAINS + 4, *fields["miss"].shape[2:])
     head[:, :LOGITS] = -40
-    sure = 0.2 * 4 * np.log(2)  # of logits of 0, whatever is right
+    sure = 0.05 * np.log(2)  # of logits of 0, whatever is right
     value, before = training.loss(head, fields, torch.ones(1))
     assert float(value.detach()) == pytest.approx(float(before) + sure, rel=1e-4)
     head[:, :4] = 40  # always a pixel less

@@ -28,7 +28,7 @@ class Table(table.Table):
     def add_column(self, header: Any = "", *arguments: Any, **options: Any) -> None:
         """Add a column; its head is shown as it is, and what is too long for it goes on in the next line."""
         options.setdefault("overflow", "fold")
-        super().add_column(Text(one_line(header)) if isinstance(header, str) else header, *arguments, **options)
+        super().add_column(Text(header) if isinstance(header, str) else header, *arguments, **options)
 
     def add_row(self, *cells: Any, **options: Any) -> None:
         """Add a row; what is no renderable of rich's is shown as it is."""

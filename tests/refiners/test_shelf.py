@@ -179,7 +179,7 @@ def refused(path):
 
 
 def test_a_missing_file(tmp_path):
-    with pytest.raises(FileError, match="no such file: .*none.npz"):
+    with pytest.raises(FileError, match=r"no such file: .*none.npz"):
         Shelf([tmp_path / "none.npz"])[0]
     refused(tmp_path)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
@@ -367,3 +368,43 @@ def test_what_does_not_fit_is_refused(change, message):
 def test_other_networks_refuse_other_scales():
     with pytest.raises(OptionError, match=r"refiner 'stereovae' needs scale=0.5, got scale=0.25"):
         stereokit.Matcher("S2", scale=0.25, refiner="stereovae", device="cpu")
+
+
+def _scene():
+    """Return a wall with a square of many pixels before it, both views and the truth."""
+    rng = np.random.default_rng(14)
+    rows, columns = 128, 256
+    wall, square = (
+        cv2.GaussianBlur(rng.integers(0, 256, (rows, columns + 64), dtype=np.uint8), (0, 0), 1.2) for _ in range(2)
+    )
+    left, right = wall[:, :columns].copy(), wall[:, 6 : columns + 6].copy()
+    left[40:90, 90:150] = square[40:90, 90:150]
+    right[40:90, 75:135] = square[40:90, 90:150]
+    truth = np.full((rows, columns), 6, np.float32)
+    truth[40:90, 90:150] = 15
+    return left, right, truth
+
+
+@pytest.mark.parametrize("scale", [1, 0.5, 0.25])
+def test_shipped_weights_sharpen_edges_and_keep_what_is_right(scale):
+    left, right, truth = _scene()
+    given = {"max_disparity": 32, "scale": scale, "device": "cpu"}
+    plain, general = (stereokit.match(left, right, "S2", refiner=r, **given) for r in ("linear", "general"))
+    wrong = [float((np.abs(found - truth)[:, 20:] > 1).mean()) for found in (plain, general)]
+    assert wrong[1] <= wrong[0]
+    if scale < 1:
+        assert wrong[1] < 0.7 * wrong[0]
+    assert abs(float(np.median(general - truth))) < (0.05 if scale > 0.25 else 0.15)
+
+
+def test_shipped_weights_follow_an_offset_of_all_disparities():
+    left, right, truth = _scene()
+    by = 200
+    wide = [np.pad(image, ((0, 0), (by, 0)), mode="edge") for image in (left, right)]
+    wide[1] = np.roll(wide[1], -by, axis=1)
+    given = {"scale": 0.5, "refiner": "general", "device": "cpu"}
+    near = stereokit.match(*wide, "S2", min_disparity=by, max_disparity=by + 32, **given)[:, by:] - by
+    plain = stereokit.match(left, right, "S2", max_disparity=32, **given)
+    medians = [float(np.median((found - truth)[:, 40:])) for found in (near, plain)]
+    assert medians[0] == pytest.approx(medians[1], abs=0.02)
+    assert np.abs(near - plain)[:, 64:].mean() < 0.05

@@ -12,10 +12,11 @@ import os
 import struct
 
 from stereokit.errors import FileError
-from stereokit.io.orientation import jpeg_segments
+from stereokit.io.orientation import jpeg_segments, png_chunks
 
 __all__ = ["check_claim"]
 
+_PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_PER_BYTE = 8 * 1032
 """Pixels: of one bit each, as deflate packs them at best. Runs and palettes of GIF and BMP stay below that."""
 _MOST_PER_BYTE_OF_HUFFMAN = 1024
@@ -38,19 +39,21 @@ def check_claim(path: str | os.PathLike[str], data: bytes) -> None:
     Raises
     ------
     FileError
-        If it is a PNG, JPEG, GIF or BMP of such a size.
+        If it is a PNG, JPEG, GIF or BMP of such a size, or a PNG of which a chunk is.
     """
     try:
         width, height, most = _claim(data)
     except struct.error:  # cut off, which the decoder tells
         return
+    if data.startswith(_PNG) and any(at + length > len(data) for _, at, length in png_chunks(data)):
+        raise FileError(f"{str(path)!r} is a broken PNG: a part of it claims more than its {len(data)} bytes")
     if width * height > most * len(data):
         raise FileError(f"{str(path)!r} claims {width}x{height} pixels, more than {len(data)} bytes can hold")
 
 
 def _claim(data: bytes) -> tuple[int, int, int]:
     """Return the width, the height and the most pixels a byte; zeros for what is not looked at."""
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+    if data.startswith(_PNG):
         return (*struct.unpack_from(">II", data, 16), _MOST_PER_BYTE)
     if data.startswith(b"\xff\xd8"):
         for marker, at in jpeg_segments(data):

@@ -239,7 +239,10 @@ def _with_tifffile(path: str | os.PathLike[str], data: bytes) -> NDArray[Any]:
             first = file.pages.first
             layout = f"{getattr(first.photometric, 'name', first.photometric)}, {first.samplesperpixel} x {first.dtype}"
             raise FileError(f"{str(path)!r} is a TIFF of a kind that cannot be decoded ({layout})")
-        return np.asarray(page.asarray())
+        image = np.asarray(page.asarray())
+        if image.ndim not in (2, 3) or image.size == 0:
+            raise FileError(f"{str(path)!r} is a TIFF that says nothing of its pixels, got {describe(image)}")
+        return image
 
 
 def encode(suffix: str, image: NDArray[Any]) -> bytes:

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["UPRIGHT", "find_orientation", "jpeg_segments", "oriented", "stored_window", "without_orientation"]
+__all__ = [
+    "UPRIGHT",
+    "find_orientation",
+    "jpeg_segments",
+    "oriented",
+    "png_chunks",
+    "stored_window",
+    "without_orientation",
+]
 
 UPRIGHT = 1
 _TAG = 0x0112
@@ -94,6 +102,15 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
         at = data.find(b"\xff", at + step)
 
 
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yield the kind of each chunk of a PNG before its end, where its content begins, and the length that it claims."""
+    at = 8
+    while data[at + 4 : at + 8] not in (b"IEND", b""):
+        length = int.from_bytes(data[at : at + 4], "big")
+        yield data[at + 4 : at + 8], at + 8, length
+        at += 12 + length
+
+
 def _place(data: bytes) -> tuple[int, Any] | None:
     """Return where the value of the tag lies in a file, two bytes, and their order; None if there is no sound one."""
     try:
@@ -112,11 +129,9 @@ def _block(data: bytes) -> int | None:
             if marker == 0xE1 and data[at : at + 6] == b"Exif\0\0":
                 return at + 6
     elif data[:8] == b"\x89PNG\r\n\x1a\n":
-        at = 8
-        while data[at + 4 : at + 8] not in (b"IEND", b""):
-            if data[at + 4 : at + 8] == b"eXIf":
-                return at + 8
-            at += 12 + int(struct.unpack_from(">I", data, at)[0])
+        for kind, at, _ in png_chunks(data):
+            if kind == b"eXIf":
+                return at
     elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         at = 12
         while data[at : at + 4]:

@@ -120,6 +120,16 @@ def test_a_small_file_that_claims_a_huge_image_never_reaches_the_decoder(suffix,
             read(path)
 
 
+def test_a_chunk_that_claims_more_than_the_file_never_reaches_the_decoder(tmp_path, monkeypatch):
+    path = tmp_path / "image.png"
+    content = cv2.imencode(".png", IMAGE)[1].tobytes()
+    at = content.index(b"IDAT")
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    path.write_bytes(content[: at - 4] + struct.pack(">I", 0x7FFFFFE3) + content[at:])
+    with pytest.raises(FileError, match=rf"a part of it claims more than its {len(content)} bytes"):
+        io.read_image(path)
+
+
 def test_a_segment_after_rubbish_still_tells_the_size_of_a_jpeg(tmp_path):
     path = tmp_path / "image.jpg"
     content = with_size(".jpg")[1](30000, 29000)
@@ -141,6 +151,21 @@ def test_blank_images_are_within_what_their_bytes_can_hold(suffix, tmp_path):
     path = tmp_path / "bits.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", bits) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
     assert io.read_image(path).shape == (6000, 8000)
+
+
+@pytest.mark.parametrize("missing", [256, 257])
+def test_a_tiff_without_a_width_or_a_height_is_one_line(missing, tmp_path):
+    pytest.importorskip("tifffile")
+    content = bytearray(cv2.imencode(".tiff", IMAGE)[1].tobytes())
+    at = struct.unpack_from("<I", content, 4)[0] + 2
+    for place in range(at, at + 12 * struct.unpack_from("<H", content, at - 2)[0], 12):
+        if struct.unpack_from("<H", content, place)[0] == missing:
+            struct.pack_into("<I", content, place + 8, 0)
+    path = tmp_path / "image.tif"
+    path.write_bytes(content)
+    for read in (io.read_image, lambda path: open_source("left", path)):
+        with pytest.raises(FileError, match=r"image\.tif"):
+            read(path)
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -38,10 +38,10 @@ _OTHER_KINDS = {
     "an OpenCV calibration (YAML)": r"\A%YAML|!!opencv-matrix",
     "an OpenCV calibration (XML)": r"<opencv_storage>",
     "an OpenCV calibration (JSON)": r'"opencv-matrix"',
-    "a ROS camera_info file": r"^\s*(projection_matrix|distortion_model|camera_name)\s*:",
-    "a Kalibr camchain": r"^\s*(T_cn_cnm1|distortion_coeffs|rostopic)\s*:",
-    "a BoofCV calibration": r"^\s*leftToRight\s*:|boofcv",
-    "a ZED settings file": r"^\s*\[(LEFT|RIGHT|STEREO)(_CAM_\w+)?\]",
+    "a ROS camera_info file": r"^[ \t]*(projection_matrix|distortion_model|camera_name)\s*:",
+    "a Kalibr camchain": r"^[ \t]*(T_cn_cnm1|distortion_coeffs|rostopic)\s*:",
+    "a BoofCV calibration": r"^[ \t]*leftToRight\s*:|boofcv",
+    "a ZED settings file": r"^[ \t]*\[(LEFT|RIGHT|STEREO)(_CAM_\w+)?\]",
     "a calibration in XML": r"\A<",
     "a calibration of Cityscapes (JSON)": r'"(intrinsic|extrinsic)"\s*:',
     "a file of bare numbers, such as K.txt": r"\A[-+.\deE\s,;\[\]()]+\Z",
@@ -273,10 +273,10 @@ def _read(path: str | os.PathLike[str], cameras: tuple[int, int]) -> Calibration
             raise FileError(f"{str(path)!r} looks like {other}, which is not read; {_KINDS}")
         if text.lstrip().startswith("{"):
             return _from_json(text)
-        if re.search(r"^\s*\w+\s*=", text, re.MULTILINE):
-            return _from_middlebury(dict(re.findall(r"^\s*(\w+)\s*=(.*)$", text, re.MULTILINE)))
-        if re.search(r"^\s*\w+:", text, re.MULTILINE):
-            return _from_kitti(dict(re.findall(r"^\s*(\w+):(.*)$", text, re.MULTILINE)), cameras)
+        if re.search(r"^[ \t]*\w+[ \t]*=", text, re.MULTILINE):
+            return _from_middlebury(dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE)))
+        if re.search(r"^[ \t]*\w+:", text, re.MULTILINE):
+            return _from_kitti(dict(re.findall(r"^[ \t]*(\w+):(.*)$", text, re.MULTILINE)), cameras)
     raise FileError(f"{str(path)!r} is no calibration known here; {_KINDS}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,8 @@ def checked_image(name: str, image: Any) -> NDArray[Any]:
     """Return an image as uint8, uint16, float32 or float64, (H, W), (H, W, 3) or, with alpha, (H, W, 4)."""
     if image is None:
         raise InputError(f"{name} must be an image, got None: was the file read?")
+    if isinstance(image, str | bytes | os.PathLike):
+        raise InputError(f"{name} must be an image, got the path {shown(image)}; read_image reads it")
     if isinstance(image, np.ma.MaskedArray):
         raise InputError(f"{name} must be a plain array, got a masked one; put NaN where there is no evidence")
     if hasattr(image, "__cuda_array_interface__"):

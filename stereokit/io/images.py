@@ -15,6 +15,7 @@ from stereokit.errors import FileError, InputError
 from stereokit.images.check import accepted_type
 from stereokit.images.intensity import to_gray
 from stereokit.io.atomic import check_output, write_bytes
+from stereokit.io.claims import check_claim
 from stereokit.io.orientation import UPRIGHT, find_orientation, oriented, without_orientation
 from stereokit.io.quiet import quiet_decoders
 from stereokit.io.reading import parsing, read_bytes, read_npy
@@ -177,6 +178,7 @@ def decode(path: str | os.PathLike[str]) -> tuple[NDArray[Any], int]:
             found = _with_opencv(stored)
             found = _with_tifffile(path, stored) if found is None else found
         else:
+            check_claim(path, data)
             found = _with_opencv(data)
         if found is None:
             what = {".npy": "npy file", ".tif": "TIFF", ".tiff": "TIFF"}.get(os.path.splitext(path)[1].lower())
@@ -237,7 +239,10 @@ def _with_tifffile(path: str | os.PathLike[str], data: bytes) -> NDArray[Any]:
             first = file.pages.first
             layout = f"{getattr(first.photometric, 'name', first.photometric)}, {first.samplesperpixel} x {first.dtype}"
             raise FileError(f"{str(path)!r} is a TIFF of a kind that cannot be decoded ({layout})")
-        return np.asarray(page.asarray())
+        image = np.asarray(page.asarray())
+        if image.ndim not in (2, 3) or image.size == 0:
+            raise FileError(f"{str(path)!r} is a TIFF that says nothing of its pixels, got {describe(image)}")
+        return image
 
 
 def encode(suffix: str, image: NDArray[Any]) -> bytes:

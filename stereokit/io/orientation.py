@@ -8,12 +8,21 @@ version and on the format, and because a pair whose views differ in it is suspic
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["UPRIGHT", "find_orientation", "oriented", "stored_window", "without_orientation"]
+__all__ = [
+    "UPRIGHT",
+    "find_orientation",
+    "jpeg_segments",
+    "oriented",
+    "png_chunks",
+    "stored_window",
+    "without_orientation",
+]
 
 UPRIGHT = 1
 _TAG = 0x0112
@@ -75,6 +84,33 @@ def stored_window(
     return (*columns, *rows) if sideways else (*rows, *columns)
 
 
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield the marker of each segment of a JPEG before its first scan, and where the segment's content begins.
+
+    What stands between segments is passed over, as decoders do.
+    """
+    at = data.find(b"\xff", 2)
+    while 0 <= at < len(data) - 3:
+        marker = data[at + 1]
+        if marker in (0xD9, 0xDA):  # the end, or a scan
+            return
+        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:  # nothing follows
+            step = 1
+        else:
+            yield marker, at + 4
+            step = 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        at = data.find(b"\xff", at + step)
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yield the kind of each chunk of a PNG before its end, where its content begins, and the length that it claims."""
+    at = 8
+    while data[at + 4 : at + 8] not in (b"IEND", b""):
+        length = int.from_bytes(data[at : at + 4], "big")
+        yield data[at + 4 : at + 8], at + 8, length
+        at += 12 + length
+
+
 def _place(data: bytes) -> tuple[int, Any] | None:
     """Return where the value of the tag lies in a file, two bytes, and their order; None if there is no sound one."""
     try:
@@ -89,20 +125,13 @@ def _block(data: bytes) -> int | None:
     if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return 0
     if data[:2] == b"\xff\xd8":
-        at = 2
-        while data[at] == 0xFF and data[at + 1] not in (0xD9, 0xDA):  # to the end, or to the scan
-            if data[at + 1] == 0xFF:  # a fill byte
-                at += 1
-                continue
-            if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
-                return at + 10
-            at += 2 + int(struct.unpack_from(">H", data, at + 2)[0])
+        for marker, at in jpeg_segments(data):
+            if marker == 0xE1 and data[at : at + 6] == b"Exif\0\0":
+                return at + 6
     elif data[:8] == b"\x89PNG\r\n\x1a\n":
-        at = 8
-        while data[at + 4 : at + 8] not in (b"IEND", b""):
-            if data[at + 4 : at + 8] == b"eXIf":
-                return at + 8
-            at += 12 + int(struct.unpack_from(">I", data, at)[0])
+        for kind, at, _ in png_chunks(data):
+            if kind == b"eXIf":
+                return at
     elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         at = 12
         while data[at : at + 4]:

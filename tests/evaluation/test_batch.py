@@ -96,6 +96,7 @@ def test_a_list_in_its_forms(tmp_path):
     [
         (b"a.png\n", "line 1 must be left,right"),
         (b"a.png,b.png,c,d\n", "line 1 must be"),
+        (b"Right,Left\nb.png,a.png\n", "line 1: the left view must come first"),
         (b"a.png,\n", "line 1 must be"),
         (b"a.png,b.png\nx/a.png,y/b.png\n", "line 2: name 'a' is that of line 1 too"),
         (b"a.png,b.png,../out\n", "name must be a file name"),
@@ -485,6 +486,8 @@ def test_a_list_may_have_further_columns_that_are_files(tmp_path):
     ):
         (tmp_path / "list.txt").write_bytes(text.encode())
         assert [pair.name for pair in list_pairs(tmp_path / "list.txt")] == names
+    (tmp_path / "list.txt").write_text("left,right,disparity\nl.png,r.png,d.png\n")
+    assert [(pair.name, os.path.basename(pair.left)) for pair in list_pairs(tmp_path / "list.txt")] == [("l", "l.png")]
     (tmp_path / "list.txt").write_text('"' + "l" * 200_000 + '",r.png\n')
     with pytest.raises(FileError, match=r"list\.txt"):
         list_pairs(tmp_path / "list.txt")

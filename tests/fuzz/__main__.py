@@ -31,7 +31,9 @@ class Watch:
     def __init__(self) -> None:
         self._case = ""
         self._begun = time.monotonic()
-        threading.Thread(target=self._look, daemon=True).start()
+        threading.Thread(
+            target=self._look, name="stereokit-watch", daemon=True
+        ).start()  # the name keeps decoders quiet
 
     def begin(self, case: str) -> None:
         """Start the clock of a case."""

@@ -253,6 +253,14 @@ def test_files_of_windows_are_read_like_others(tmp_path, change):
     assert plain.width == 640 and isinstance(plain.width, int)
 
 
+@pytest.mark.parametrize("text", ["\n" * 300_000 + "x", " \n" * 300_000 + "x", "x\n" + "\n" * 300_000 + ":"])
+def test_a_file_of_blank_lines_is_refused_and_does_not_hang(tmp_path, text):
+    path = tmp_path / "calib.txt"  # the time of the patterns grew with the square of the blank lines: hours for these
+    path.write_text(text)
+    with pytest.raises(FileError, match="no calibration known here"):
+        read_calibration(path)
+
+
 def test_sizes_may_be_whole_numbers_of_any_type():
     sizes = Calibration(1, 1, 0, 0, 1, width=np.int64(4), height=3.0)
     assert (sizes.width, sizes.height) == (4, 3) and isinstance(sizes.width, int)

@@ -7,6 +7,7 @@ import os
 import struct
 import sys
 import threading
+import zlib
 
 import cv2
 import numpy as np
@@ -77,6 +78,94 @@ HOSTILE = {
     "cut.jpg": cv2.imencode(".jpg", COLOR)[1].tobytes()[:100],
     "cut.webp": cv2.imencode(".webp", COLOR)[1].tobytes()[:60],
 }
+
+
+def chunk(kind, content):
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def with_size(suffix):
+    """Return a good image of 64 x 96 and the function that gives it another size, all else as it was."""
+    grey = np.zeros((64, 96), np.uint8)
+    data = cv2.imencode(suffix, grey if suffix in (".jpg", ".bmp") else np.dstack([grey] * 3))[1].tobytes()
+    at, layout = {
+        ".png": (16, ">II"),
+        ".gif": (6, "<HH"),
+        ".bmp": (18, "<ii"),
+        ".jpg": (data.find(b"\xff\xc0") + 5, ">HH"),
+    }[suffix]
+
+    def claiming(width, height):
+        size = (height, width) if suffix == ".jpg" else (width, height)
+        changed = bytearray(data)
+        struct.pack_into(layout, changed, at, *size)
+        if suffix == ".png":
+            changed[12:33] = chunk(b"IHDR", changed[16:29])[4:]
+        return bytes(changed)
+
+    return data, claiming
+
+
+@pytest.mark.parametrize("suffix", [".png", ".gif", ".bmp", ".jpg"])
+def test_a_small_file_that_claims_a_huge_image_never_reaches_the_decoder(suffix, tmp_path, monkeypatch):
+    data, claiming = with_size(suffix)
+    path = tmp_path / f"image{suffix}"
+    path.write_bytes(data)
+    assert io.read_image(path).shape[:2] == (64, 96)
+    assert claiming(96, 64) == data
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    path.write_bytes(claiming(30000, 29000))
+    for read in (io.read_image, lambda path: open_source("left", path)):
+        with pytest.raises(FileError, match=rf"claims 30000x29000 pixels, more than {len(data)} bytes can hold"):
+            read(path)
+
+
+def test_a_chunk_that_claims_more_than_the_file_never_reaches_the_decoder(tmp_path, monkeypatch):
+    path = tmp_path / "image.png"
+    content = cv2.imencode(".png", IMAGE)[1].tobytes()
+    at = content.index(b"IDAT")
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    path.write_bytes(content[: at - 4] + struct.pack(">I", 0x7FFFFFE3) + content[at:])
+    with pytest.raises(FileError, match=rf"a part of it claims more than its {len(content)} bytes"):
+        io.read_image(path)
+
+
+def test_a_segment_after_rubbish_still_tells_the_size_of_a_jpeg(tmp_path):
+    path = tmp_path / "image.jpg"
+    content = with_size(".jpg")[1](30000, 29000)
+    path.write_bytes(content[:2] + b"rub\xff\x00bish\xff" + content[2:])
+    with pytest.raises(FileError, match="claims 30000x29000"):
+        io.read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".jp2", ".webp"])
+def test_blank_images_are_within_what_their_bytes_can_hold(suffix, tmp_path):
+    path = tmp_path / f"image{suffix}"
+    for shape in ((1500, 2000, 3), (1500, 2000)):
+        if suffix == ".webp" and len(shape) == 2:
+            continue  # it knows colour only
+        path.write_bytes(cv2.imencode(suffix, np.full(shape, 7, np.uint8))[1].tobytes())
+        assert io.read_image(path).shape == shape
+    bits = struct.pack(">IIBBBBB", 8000, 6000, 1, 0, 0, 0, 0)  # one bit a pixel, packed as well as deflate can
+    rows = zlib.compress(bytes(6000 * 1001), 9)
+    path = tmp_path / "bits.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", bits) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    assert io.read_image(path).shape == (6000, 8000)
+
+
+@pytest.mark.parametrize("missing", [256, 257])
+def test_a_tiff_without_a_width_or_a_height_is_one_line(missing, tmp_path):
+    pytest.importorskip("tifffile")
+    content = bytearray(cv2.imencode(".tiff", IMAGE)[1].tobytes())
+    at = struct.unpack_from("<I", content, 4)[0] + 2
+    for place in range(at, at + 12 * struct.unpack_from("<H", content, at - 2)[0], 12):
+        if struct.unpack_from("<H", content, place)[0] == missing:
+            struct.pack_into("<I", content, place + 8, 0)
+    path = tmp_path / "image.tif"
+    path.write_bytes(content)
+    for read in (io.read_image, lambda path: open_source("left", path)):
+        with pytest.raises(FileError, match=r"image\.tif"):
+            read(path)
 
 
 @pytest.mark.parametrize("name", HOSTILE)

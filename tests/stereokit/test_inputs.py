@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import oracles
 import pytest
@@ -260,9 +262,10 @@ A = np.zeros((4, 5), np.uint8)
         (A.astype(complex), A, ["left", "complex"]),
         (A, A.astype("M8[s]"), ["right", "datetime64"]),
         (A.astype(object), A, ["left", "object"]),
-        ("left.png", A, ["left", "numbers", "<U8"]),
         (None, A, ["left", "None", "was the file read?"]),
         (A, None, ["right", "None", "was the file read?"]),
+        ("left.png", A, ["left", "path", "read_image"]),
+        (A, Path("right.png"), ["right", "path", "read_image"]),
         ([[1, 2], [3]], A, ["left"]),
     ],
 )

@@ -144,10 +144,12 @@ def list_pairs(path: Path) -> list[Pair]:
             continue
         with parsing(path, "list"):
             cells = [cell.strip() for cell in _cells(text)]
-        if first and [cell.lower() for cell in cells] in (["left", "right"], ["left", "right", "name"]):
-            first = False
-            continue
+        head = [cell.lower() for cell in cells[:2]] if first else []
         first = False
+        if head == ["left", "right"]:
+            continue
+        if head == ["right", "left"]:
+            raise FileError(f"{str(path)!r} line {number}: the left view must come first, got the columns {text!r}")
         while len(cells) > 2 and _is_file(cells[-1]):  # the true disparity, say
             cells.pop()
         if len(cells) not in (2, 3) or not all(cells):

@@ -196,7 +196,7 @@ def test_view_writes_one_page(files, monkeypatch):
 def test_view_takes_refiners(files):
     words = ("view", files / "l.png", files / "r.png", "--max-disparity", 16, "--scale", 0.5, "--refiner", "linear")
     done = command(*words, "-o", files / "out.html", "--json", "-")
-    assert json.loads(done.stdout)["methods"] == ["S4 Mini+Linear"]
+    assert json.loads(done.stdout)["methods"] == ["S2 Mini+Linear"]
 
 
 @pytest.mark.parametrize(

@@ -337,7 +337,7 @@ def test_training_gives_each_matcher_its_own_weights(tmp_path, monkeypatch):
         calls.append((refiner, method[0], frames, streets, settings))
         (home / "weights.safetensors").write_bytes(b"not weights")
 
-    monkeypatch.setattr(per_matcher, "train", train)
+    monkeypatch.setattr(per_matcher, "run_training", train)
     monkeypatch.setattr(datasets, "_SCENE_SIZE", (96, 48))
     datasets._scene.cache_clear()
     words = ["--dataset", "scenes", "--count", "1", "--method", "S2", "--method", "S4", "--setting", "cnn"]

@@ -30,6 +30,7 @@ class TwoLayers:
     name: ClassVar[str] = "two"
     inputs: ClassVar[dict[str, int]] = {"image": 1}
     multiple: ClassVar[int] = 1
+    innermost: ClassVar[bool] = False
 
     def __init__(self, channels, kernel, stride=1):
         self.layers = Layer("a", 1, channels, kernel=1), Layer("b", channels, 16, kernel=kernel, stride=stride)

@@ -24,7 +24,7 @@ def stages_of(method):
 
 def used(matcher, option):
     """Return the value of an option that a matcher computes with."""
-    for part in (matcher.cost, matcher.aggregation, matcher):
+    for part in (matcher.cost, matcher.aggregation, matcher.settings):
         if hasattr(part, option):
             return getattr(part, option)
     raise AssertionError(f"{option} is nowhere in {matcher!r}")

@@ -45,6 +45,7 @@ def test_mirrored_pairs_mirror(seed, method, low, count):
     np.testing.assert_array_equal(result.disparity, mirrored.right[:, ::-1])
 
 
+@pytest.mark.filterwarnings("ignore:left and right.* grey levels hold:stereokit.errors.StereokitWarning")
 @given(
     seed=SEEDS,
     gains=st.tuples(st.integers(1, 30), st.integers(1, 30)),

@@ -7,15 +7,16 @@ exception inside loops). There is no ``fastmath``: results must not depend on th
 several of them at once, which is safe from any number of calling threads and compiles in half the time.
 
 Numba files a compiled kernel under the name of its function and looks only at the file which that stands in, not
-at the functions that are compiled into it. So each name carries a fingerprint of the whole package's source: after
-an upgrade, or an edit anywhere, nothing stale is ever loaded.
+at the functions that are compiled into it. So each name carries a digest of every module that makes kernels and of
+all that these import: after an upgrade, or an edit to any of them, nothing stale is ever loaded.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,7 +26,7 @@ from numba.extending import overload
 
 from stereokit.kernels.cache import cache_of
 
-__all__ = ["CHECKED", "FINGERPRINT", "by_types", "inline", "kernel"]
+__all__ = ["CHECKED", "FINGERPRINT", "by_types", "inline", "kernel", "kernel_sources"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -34,15 +35,41 @@ CHECKED = os.environ.get("STEREOKIT_CHECKED", "0") not in ("", "0")
 """Whether kernels check each access to an array; one outside of it ends the process. For tests: slow to compile."""
 
 
-def _fingerprint() -> str:
+_ROOT = Path(__file__).parents[1]
+_IMPORT = re.compile(rb"^ *from (stereokit[.\w]*) import +(\([^)]*\)|[^\n]*)", re.MULTILINE)
+
+
+def _digest(paths: Iterable[Path]) -> str:
     digest = hashlib.sha256(b"checked" if CHECKED else b"")
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    for path in sorted(paths):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 
 
-FINGERPRINT = _fingerprint()
+def _imports(path: Path) -> set[Path]:
+    """Return the modules of the package that a module imports; a line that names nothing of it adds nothing."""
+    found = set()
+    for module, names in _IMPORT.findall(path.read_bytes()):
+        place = _ROOT.joinpath(*module.decode().split(".")[1:])
+        inner = [place / name for name in re.findall(r"\w+", names.decode())]
+        found |= {file for each in (place, *inner) for file in (each.with_suffix(".py"), each / "__init__.py")}
+    return {file for file in found if file.is_file()}
+
+
+def kernel_sources() -> set[Path]:
+    """Return the modules that compiled code may depend on: those that use `stereokit.kernels`, and their imports."""
+    sources: set[Path] = set()
+    waiting = {path for path in _ROOT.rglob("*.py") if b"stereokit.kernels.jit" in path.read_bytes()}
+    while waiting:
+        sources |= waiting
+        waiting = set().union(*map(_imports, waiting)) - sources
+    return sources
+
+
+FINGERPRINT = _digest(_ROOT.rglob("*.py"))
 """A digest of the package's source: it changes with anything that a result may depend on."""
+
+_STAMP = _digest(kernel_sources())
 
 
 # Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
@@ -52,7 +79,7 @@ _FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, 
 
 def kernel(function: F) -> F:
     """Compile `function` as a kernel that Python code calls."""
-    function.__qualname__ = f"{function.__qualname__}_{FINGERPRINT}"
+    function.__qualname__ = f"{function.__qualname__}_{_STAMP}"
     compiled: F = numba.njit(**_FLAGS)(function)
     if hasattr(compiled, "_cache"):  # not where NUMBA_DISABLE_JIT is set
         compiled._cache = cache_of(function)

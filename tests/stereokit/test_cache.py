@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import pytest
 import stereokit
 import stereokit_refiners
 from stereokit.kernels import cache
+from stereokit.kernels.jit import kernel_sources
 
 USE = """
     import warnings
@@ -174,3 +176,17 @@ def test_a_cache_that_cannot_be_read_is_left_alone(kernels, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cache, "_warned", True)
         assert not double(kernels())
+
+
+def test_names_of_kernels_change_with_what_is_compiled_and_nothing_else():
+    """A kernel takes in helpers of other modules; the command line is none of them."""
+    sources = {path.relative_to(Path(stereokit.__file__).parent).as_posix() for path in kernel_sources()}
+    makers = {
+        path.relative_to(Path(stereokit.__file__).parent).as_posix()
+        for path in Path(stereokit.__file__).parent.rglob("*.py")
+        if re.search(r"^@(inline|kernel|by_types)\b", path.read_text("utf-8"), re.MULTILINE)
+        and not path.stem.endswith("_cuda")  # these are compiled in memory
+    }
+    assert {"costs/census.py", "aggregation/_paths.py"} <= makers <= sources
+    assert {"kernels/simd.py", "images/check.py"} <= sources  # imported by these
+    assert not sources & {"matching.py", "calibration.py", "cli/match.py", "result.py"}

@@ -66,4 +66,4 @@ def test_a_workspace_makes_again_what_was_made_for_another_key():
         made.append(len(made))
         return made[-1]
 
-    assert [workspace.once("a", key, make) for key in (1, 1, 2, 2, 1)] == [0, 0, 1, 1, 2]
+    assert [workspace.cached("a", key, make) for key in (1, 1, 2, 2, 1)] == [0, 0, 1, 1, 2]

@@ -84,6 +84,12 @@ class Disparity:
             f"Disparity({height}x{width}, {span}, {100 * self.density:.1f} % measured{''.join(f', {m}' for m in more)})"
         )
 
+    def _repr_png_(self) -> bytes:
+        """Return the map in colours, as notebooks show it."""
+        good, data = cv2.imencode(".png", self.color()[:, :, ::-1])
+        assert good
+        return data.tobytes()
+
     @property
     def density(self) -> float:
         """The share of pixels that were measured, from 0 to 1."""

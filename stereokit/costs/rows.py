@@ -25,11 +25,9 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numba import types
-from numba.extending import overload
 from numpy.typing import NDArray
 
-from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import LANES, bitwise_or, load, maximum, minimum, splat, store
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
@@ -152,24 +150,25 @@ class CellMask(NamedTuple):
     padding: NDArray[np.uint8]  # (P): 0 for levels that exist, 255 for those that pad
 
 
-def cost_row(rows: Any, y: int, out: Any) -> None:
+_PRODUCERS: dict[type, Callable[..., None]] = {}
+"""The compiled function that writes a row, by the named tuple of its producer."""
+
+
+@by_types
+def cost_row(rows: Any, y: Any, out: Any) -> Any:
     """Write the costs of image row `y` into the flat ``uint8`` array `out` (``W * P``); compiled code only."""
-    raise NotImplementedError("cost_row can be called from compiled code only")
+    function = _PRODUCERS[rows.instance_class]
+    return lambda rows, y, out: function(rows, y, out)
 
 
 def implements(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that makes a compiled function the `cost_row` of the named tuple `kind`."""
 
-    def add(function: Callable[..., None]) -> Callable[..., None]:
-        def choose(rows: Any, y: Any, out: Any) -> Any:
-            if isinstance(rows, types.BaseNamedTuple) and rows.instance_class is kind:
-                return lambda rows, y, out: function(rows, y, out)
-            return None
-
-        overload(cost_row, strict=False)(choose)
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        _PRODUCERS[kind] = function
         return function
 
-    return add
+    return register
 
 
 def cell_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:

@@ -1,4 +1,7 @@
-"""Every public name of `stereokit.kernels.simd` against a plain loop over lanes, in exact arithmetic."""
+"""Every public name of `stereokit.kernels.simd` against a plain loop over lanes, in exact arithmetic.
+
+So are their stand-ins in `cpu.lanes`, with which tests interpret kernels.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,11 @@ import math
 import re
 import struct
 from pathlib import Path
+from types import FunctionType
 
 import numpy as np
 import pytest
+from cpu import lanes
 
 from stereokit.kernels import simd
 from stereokit.kernels.jit import kernel
@@ -16,6 +21,21 @@ from stereokit.kernels.jit import kernel
 INTEGERS = (np.uint8, np.int8, np.uint16, np.int16, np.int32)
 EXTREMES = (0, 1, -1, 127, 128, -128, 255, 256, 2**15 - 1, 2**15, -(2**15), 2**16 - 1, 2**31 - 1, -(2**31))
 COUNT = simd.LANES
+
+
+@pytest.fixture(params=["compiled", "interpreted"])
+def run(request):
+    """Return a function that runs a kernel of this file."""
+
+    def compiled(function, *arguments):
+        function(*arguments)
+
+    def interpreted(function, *arguments):
+        code = getattr(function, "py_func", function).__code__
+        with np.errstate(all="ignore"):
+            FunctionType(code, {"np": np, "simd": lanes})(*arguments)
+
+    return compiled if request.param == "compiled" else interpreted
 
 
 def wrap(value, dtype):
@@ -71,11 +91,11 @@ def _integer_lanes(a, b, shift, out):
 
 @pytest.mark.parametrize("dtype", INTEGERS)
 @pytest.mark.parametrize("shift", [0, 3])
-def test_operations_on_integers(dtype, shift):
+def test_operations_on_integers(run, dtype, shift):
     a, b = integers(dtype, 0), integers(dtype, 1)
     info, bits = np.iinfo(dtype), 8 * np.dtype(dtype).itemsize
     out = np.empty(15 * COUNT, dtype)
-    _integer_lanes(a, b, shift, out)
+    run(_integer_lanes, a, b, shift, out)
     rules = {
         "add": lambda x, y: x + y,
         "subtract": lambda x, y: x - y,
@@ -111,10 +131,10 @@ def _float_lanes(a, b, out, bits):
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_operations_on_floats_are_single_and_of_ieee():
+def test_operations_on_floats_are_single_and_of_ieee(run):
     a, b = floats(0), floats(1)
     out, bits = np.empty(5 * COUNT, np.float32), np.empty(COUNT, np.int32)
-    _float_lanes(a, b, out, bits)
+    run(_float_lanes, a, b, out, bits)
     single = [(np.float32(x), np.float32(y)) for x, y in zip(a, b, strict=True)]
     rows = out.reshape(5, COUNT)
     np.testing.assert_array_equal(rows[0], [x + y for x, y in single], "add")
@@ -125,11 +145,11 @@ def test_operations_on_floats_are_single_and_of_ieee():
     np.testing.assert_array_equal(bits, [struct.unpack("i", struct.pack("f", x))[0] for x in a], "bits_of")
 
 
-def test_a_product_is_rounded_before_it_is_added():
+def test_a_product_is_rounded_before_it_is_added(run):
     """A contracted multiplication and addition would keep the last bits."""
     a = np.full(COUNT, np.float32(1) + np.float32(2**-12), np.float32)
     out = np.empty(COUNT, np.float32)
-    _product_and_sum(a, np.full(COUNT, np.float32(-1), np.float32), out)
+    run(_product_and_sum, a, np.full(COUNT, np.float32(-1), np.float32), out)
     product = np.float32(a[0]) * np.float32(a[0])
     np.testing.assert_array_equal(out, [product + np.float32(-1)] * COUNT)
 
@@ -145,10 +165,10 @@ def _high_words(a, b, out):
     simd.store(out, 0, simd.multiply_high(simd.load(a, 0), simd.load(b, 0)))
 
 
-def test_high_words_of_products_round_down():
+def test_high_words_of_products_round_down(run):
     a, b = integers(np.int16, 0), integers(np.int16, 1)
     out = np.empty(COUNT, np.int16)
-    _high_words(a, b, out)
+    run(_high_words, a, b, out)
     np.testing.assert_array_equal(out, loop(lambda x, y: (x * y) // 2**16, a, b, dtype=np.int16))
 
 
@@ -157,7 +177,7 @@ def _pairs(a, b, out):
     simd.store(out, 0, simd.multiply_pairs(simd.load(a, 0), simd.load(b, 0)))
 
 
-def test_pairs_of_words_are_multiplied_and_added():
+def test_pairs_of_words_are_multiplied_and_added(run):
     a, b = integers(np.int32, 0), integers(np.int32, 1)
     low, high = 2**15 - 1, -(2**15)
     for k, parts in enumerate([(high, high, high, high), (low, low, low, low), (high, low, 1, -1), (-1, 0, 1, high)]):
@@ -167,7 +187,7 @@ def test_pairs_of_words_are_multiplied_and_added():
         return sum(wrap(x >> s, np.int16) * wrap(y >> s, np.int16) for s in (0, 16))
 
     out = np.empty(COUNT, np.int32)
-    _pairs(a, b, out)
+    run(_pairs, a, b, out)
     np.testing.assert_array_equal(out, loop(rule, a, b, dtype=np.int32))
 
 
@@ -180,17 +200,17 @@ def _comparisons(a, b, bit, marks, masks):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_comparisons_of_lanes(dtype):
+def test_comparisons_of_lanes(run, dtype):
     a, b = integers(dtype, 0), integers(dtype, 1)
     a[[0, 1, 2]] = b[[0, 1, 2]] + 1  # none of the first is equal
     a[[5, 40, 63]] = b[[5, 40, 63]]
     marks, masks = np.empty(COUNT, np.uint8), np.empty(2, np.uint64)
-    _comparisons(a, b, np.uint8(32), marks, masks)
+    run(_comparisons, a, b, np.uint8(32), marks, masks)
     np.testing.assert_array_equal(marks, [32 if int(x) < int(y) else 0 for x, y in zip(a, b, strict=True)], "mark_less")
     equal = [k for k in range(COUNT) if a[k] == b[k]]
     assert int(masks[0]) == sum(2**k for k in equal)
     assert int(masks[1]) == equal[0] > 0
-    _comparisons(np.zeros(COUNT, dtype), np.ones(COUNT, dtype), np.uint8(1), marks, masks)
+    run(_comparisons, np.zeros(COUNT, dtype), np.ones(COUNT, dtype), np.uint8(1), marks, masks)
     assert masks.tolist() == [0, 64]
 
 
@@ -216,9 +236,9 @@ def _converted(values, out):
         (np.int32, np.int32),
     ],
 )
-def test_conversions_of_integers(source, target):
+def test_conversions_of_integers(run, source, target):
     values, out = integers(source, 0), np.zeros(COUNT, target)
-    _converted(values, out)
+    run(_converted, values, out)
     if target is np.float32:
         np.testing.assert_array_equal(out, [np.float32(int(value)) for value in values])
     else:
@@ -226,9 +246,9 @@ def test_conversions_of_integers(source, target):
 
 
 @pytest.mark.parametrize("target", [np.int32, np.int16])
-def test_floats_are_cut_towards_zero(target):
+def test_floats_are_cut_towards_zero(run, target):
     values, out = np.linspace(-3000.9, 3000.9, COUNT, dtype=np.float32), np.zeros(COUNT, target)
-    _converted(values, out)
+    run(_converted, values, out)
     np.testing.assert_array_equal(out, [math.trunc(float(value)) for value in values])
 
 
@@ -241,13 +261,13 @@ def _lowest_of_4(a, out):
     simd.store(out, 192, lows[3])
 
 
-def test_the_smallest_lane_of_each_of_four_vectors():
+def test_the_smallest_lane_of_each_of_four_vectors(run):
     rng = np.random.default_rng(2)
     out = np.empty(4 * COUNT, np.uint8)
     for at in range(COUNT):  # every lane is the smallest once
         values = rng.integers(4, 256, (4, COUNT)).astype(np.uint8)
         values[[0, 1, 2, 3], [(at + 17 * k) % COUNT for k in range(4)]] = [2, 0, 3, 1]
-        _lowest_of_4(values.ravel(), out)
+        run(_lowest_of_4, values.ravel(), out)
         np.testing.assert_array_equal(out.reshape(4, COUNT), np.repeat([[2], [0], [3], [1]], COUNT, axis=1))
 
 
@@ -258,10 +278,10 @@ def _scalars(values, out):
         out[values.size + k] = simd.select(values[k] > 5, k, -k)
 
 
-def test_operations_on_single_numbers():
+def test_operations_on_single_numbers(run):
     values = np.array([0, 1, 5, 6, 2**31, 2**32 - 1, 0xAAAAAAAA], np.uint32)
     out = np.empty(2 * values.size, np.int64)
-    _scalars(values, out)
+    run(_scalars, values, out)
     assert out[: values.size].tolist() == [bin(value).count("1") for value in values.tolist()]
     assert out[values.size :].tolist() == [k if value > 5 else -k for k, value in enumerate(values.tolist())]
 
@@ -277,21 +297,37 @@ def _moved(values, at, out):
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 @pytest.mark.parametrize("at", [0, 1, 36])
-def test_loads_and_stores_at_any_offset(dtype, at):
+def test_loads_and_stores_at_any_offset(run, dtype, at):
     values = np.random.default_rng(3).integers(0, 256, 100).astype(dtype)
     out = simd.aligned((200,), dtype)
     assert out.ctypes.data % 64 == 0 and out.flags.c_contiguous and out.shape == (200,)
     out[:] = 7
-    _moved(values, at, out)
+    run(_moved, values, at, out)
     expected = [*values[at : at + 64], 7, 7, 7, *[values[at + 1]] * 64, *[values[at + 2]] * 64, *[7] * 5]
     np.testing.assert_array_equal(out, expected)
 
 
-def test_aligned_arrays_of_every_shape():
+@pytest.mark.parametrize("aligned", [simd.aligned, lanes.aligned])
+def test_aligned_arrays_of_every_shape(aligned):
     for shape in ((1,), (3, 5), (1, 2, 3)):
-        array = simd.aligned(shape, np.int16)
+        array = aligned(shape, np.int16)
         assert array.shape == shape and array.dtype == np.int16 and array.ctypes.data % 64 == 0
-    assert simd.aligned((0,), np.float32).size == 0
+    assert aligned((0,), np.float32).size == 0
+
+
+@pytest.mark.parametrize("offset", [-1, 37, 10**6])
+def test_stand_ins_check_bounds_and_alignment(offset):
+    array = lanes.aligned((100,), np.uint8)
+    vector = lanes.splat(np.uint8(1))
+    for access in (lambda: lanes.load(array, offset), lambda: lanes.store(array, offset, vector)):
+        with pytest.raises(lanes.OutOfBounds):
+            access()
+    with pytest.raises(lanes.OutOfBounds):
+        lanes.splat_at(array, 100)
+    with pytest.raises(lanes.Misaligned):
+        lanes.stream(array, 1, vector)
+    with pytest.raises(TypeError):
+        lanes.store(array, 0, lanes.splat(np.int16(1)))
 
 
 def test_the_type_of_vectors():
@@ -307,3 +343,4 @@ def test_the_type_of_vectors():
 def test_no_public_name_is_left_out():
     used = set(re.findall(r"\bsimd\.(\w+)", Path(__file__).read_text("utf-8")))
     assert used >= set(simd.__all__) and all(hasattr(simd, name) for name in used)
+    assert all(hasattr(lanes, name) for name in set(simd.__all__) - {"Vector", "vector_bits"})

@@ -28,7 +28,7 @@ _LONGEST_REASON = 200
 def parsing(path: str | os.PathLike[str], what: str, rule: str | None = None) -> Iterator[None]:
     """Turn everything that is raised in a ``with`` block into a `FileError` that names the file.
 
-    An interrupt passes, and so does a `FileError`. That the memory does not suffice counts as a fault of the file: its
+    An interrupt passes, and so do a `FileError` and a warning. That the memory does not suffice counts as a fault of the file: its
     size is what it claims.
 
     Parameters
@@ -49,7 +49,7 @@ def parsing(path: str | os.PathLike[str], what: str, rule: str | None = None) ->
     name = repr(str(path))
     try:
         yield
-    except FileError:
+    except (FileError, Warning):  # a warning is one where the filters of `warnings` say so
         raise
     except StereokitError as error:  # a rule of ours that the content breaks
         raise FileError(f"{name}: {error}") from error

@@ -19,6 +19,7 @@ from stereokit.cli.options import (
     RefinerOption,
     ScaleOption,
     SettingsOption,
+    WeightsOption,
     check_fits_png,
     check_json,
     described,
@@ -49,6 +50,7 @@ def match(
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,
     refiner: RefinerOption = None,
+    weights: WeightsOption = None,
     fill: FillOption = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
     device: DeviceOption = "auto",
@@ -94,7 +96,7 @@ def match(
     if (ply is None) != (calibration is None):
         raise OptionError("--ply and --calibration go together, got only one of them")
     chosen = parse_settings(settings or [])
-    wanted = {"fill": fill, "right": right and True, "confidence": confidence and True}
+    wanted = {"fill": fill, "weights": weights, "right": right and True, "confidence": confidence and True}
     chosen.update({name: value for name, value in wanted.items() if value is not None})
     matching: dict[str, Any] = {
         "max_disparity": max_disparity,

@@ -28,9 +28,11 @@ __all__ = [
     "TIFF_STARTS",
     "check_orientations",
     "decode",
+    "decode_bytes",
     "describe",
     "encode",
     "open_tiff",
+    "plain_image",
     "read_image",
     "read_oriented",
     "read_pair",
@@ -112,16 +114,27 @@ def read_oriented(path: str | os.PathLike[str], gray: bool = False) -> tuple[NDA
         If the file is missing or is not an image.
     """
     image, tag = decode(path)
+    return plain_image(path, image, gray), tag
+
+
+def plain_image(path: str | os.PathLike[str], image: NDArray[Any], gray: bool = False) -> NDArray[Any]:
+    """Return a decoded image as `read_image` does: of an accepted type, grey or RGB, without alpha.
+
+    Raises
+    ------
+    FileError
+        If it has another type or number of channels.
+    """
     kind = accepted_type(image.dtype)
     if kind is None:
         raise FileError(f"{str(path)!r} holds {image.dtype} pixels, expected whole or floating-point numbers")
     image = image.astype(kind, copy=False)
     if image.ndim == 2 or image.shape[2] == 1:
-        return np.ascontiguousarray(image.reshape(image.shape[:2])), tag
+        return np.ascontiguousarray(image.reshape(image.shape[:2]))
     if image.shape[2] not in (3, 4):
         raise FileError(f"{str(path)!r} has {image.shape[2]} channels, expected grey or colour")
     colors = np.ascontiguousarray(image[:, :, :3])
-    return (to_gray(colors) if gray else colors), tag
+    return to_gray(colors) if gray else colors
 
 
 def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:
@@ -165,7 +178,11 @@ def decode(path: str | os.PathLike[str]) -> tuple[NDArray[Any], int]:
     FileError
         If the file is missing or is not an image.
     """
-    data = read_bytes(path)
+    return decode_bytes(path, read_bytes(path))
+
+
+def decode_bytes(path: str | os.PathLike[str], data: bytes) -> tuple[NDArray[Any], int]:
+    """Return the image that a file of this content holds; see `decode`."""
     with parsing(path, "image"):
         if data.startswith(NPY_START):
             image, tag = read_npy(path, data), UPRIGHT

@@ -28,8 +28,8 @@ _LONGEST_REASON = 200
 def parsing(path: str | os.PathLike[str], what: str, rule: str | None = None) -> Iterator[None]:
     """Turn everything that is raised in a ``with`` block into a `FileError` that names the file.
 
-    An interrupt passes, and so do a `FileError` and a warning. That the memory does not suffice counts as a fault of the file: its
-    size is what it claims.
+    An interrupt passes, and so do a `FileError` and a warning. That the memory does not suffice counts as a fault of
+    the file: its size is what it claims.
 
     Parameters
     ----------

@@ -154,7 +154,7 @@ def check(words: list[str], run_python: Callable[..., str] | None) -> None:
             folder, extras = re.fullmatch(r"([^\[]*)(\[.*\])?", target).groups()
             if not (ROOT / folder / "pyproject.toml").is_file():
                 assert Requirement(target).extras <= known, line
-            elif (ROOT / folder).resolve() == ROOT and extras:  # `.[fast]`: this checkout
+            elif (ROOT / folder).resolve() == ROOT and extras:  # `.[refiners]`: this checkout
                 assert Requirement(f"stereokit{extras}").extras <= known, line
     elif words[0] == "make":
         assert f"\n{words[1]}:" in (ROOT / "Makefile").read_text(), line

@@ -57,6 +57,16 @@ def test_the_licence_of_the_weights_is_in_the_metadata():
     assert set(files) == {"LICENSE", "refiners/stereokit_refiners/weights/LICENSE"}
 
 
+@pytest.mark.parametrize(("old", "new"), [("evaluation", "scenes"), ("fast", "refiners"), ("large", "tiff")])
+def test_extras_have_their_old_names_too(old, new):
+    required = {name: set() for name in metadata("stereokit").get_all("Provides-Extra")}
+    for requirement in map(Requirement, requires("stereokit")):
+        for extra in (old, new):
+            if requirement.marker is not None and requirement.marker.evaluate({"extra": extra}):
+                required[extra].add(requirement.name)
+    assert required[old] == required[new] != set()
+
+
 @pytest.mark.parametrize("name", ["stereokit", "stereokit_refiners", "stereokit_evaluation"])
 def test_packages_are_typed(name):
     folder = next(ROOT / package for package in PACKAGES if package.endswith(name))

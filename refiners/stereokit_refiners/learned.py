@@ -350,7 +350,7 @@ def _backend(name: str) -> str:
     if name == "auto":
         if not there:
             raise StereokitError(
-                "learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[fast]', or "
+                "learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[refiners]', or "
                 "'stereokit[onnx]' where OpenVINO has no wheel"
             )
         return there[0]

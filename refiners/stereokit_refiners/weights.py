@@ -91,7 +91,7 @@ def _library() -> Any:
         import safetensors.numpy
     except ImportError:
         raise StereokitError(
-            "learned refiners need safetensors, which is not installed: pip install 'stereokit[fast]'"
+            "learned refiners need safetensors, which is not installed: pip install 'stereokit[refiners]'"
         ) from None
     return safetensors
 

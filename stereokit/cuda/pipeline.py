@@ -279,7 +279,7 @@ class CudaPipeline:
         if settings.smooth > 0:
             images, dtype = smooth(queue, images, dtype, settings.smooth, shape), np.dtype(np.uint16)
         masks = queue.array("no.bad", 1, np.uint8) if bad is None else bad
-        scene = Scene(images, dtype, masks, bad is not None, height, width, levels, settings.outside, ranges)
+        scene = Scene(images, dtype, masks, bad is not None, height, width, levels, settings.border_cost, ranges)
         if pixels * scene.padded >= 2**34:
             raise DeviceError(
                 f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * scene.padded}"

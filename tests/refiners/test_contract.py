@@ -316,7 +316,7 @@ def test_a_runtime_that_is_not_there_is_named(monkeypatch):
     for backend, extra in {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}.items():
         with pytest.raises(StereokitError, match=rf"^backend '{backend}' is not installed: .*stereokit\[{extra}\]'$"):
             LearnedRefiner.of(random_content("cnn"), backend=backend)
-    rule = r"need OpenVINO, ONNX Runtime or torch: pip install 'stereokit\[fast\]', or 'stereokit\[onnx\]' where "
+    rule = r"need OpenVINO, ONNX Runtime or torch: pip install 'stereokit\[refiners\]', or 'stereokit\[onnx\]' where "
     with pytest.raises(StereokitError, match=rule):
         LearnedRefiner.of(random_content("cnn"))
 

@@ -208,7 +208,7 @@ def test_without_safetensors_the_extra_is_named(monkeypatch, tmp_path):
     import sys
 
     monkeypatch.setitem(sys.modules, "safetensors", None)
-    with pytest.raises(StereokitError, match=r"need safetensors, which is not installed: .*stereokit\[fast\]'$"):
+    with pytest.raises(StereokitError, match=r"need safetensors, which is not installed: .*stereokit\[refiners\]'$"):
         read(tmp_path / "w.safetensors")
 
 

@@ -74,19 +74,19 @@ def joined(*bad: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     return None if not known else known[0] if len(known) == 1 else np.logical_or.reduce(known)
 
 
-def black_border(gray: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Return the pixels of the black borders of a grey image, None if there are none.
+def black_border(image: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """Return the pixels of the black borders of an image, None if there are none.
 
     Parameters
     ----------
-    gray : (H, W) uint8 or uint16
+    image : (H, W), (H, W, 3) or (H, W, 4)
+        Alpha does not count.
     """
-    sides = gray[0], gray[-1], gray[:, 0], gray[:, -1]
-    if not any(np.count_nonzero(side == 0) for side in sides):
+    colors = image[:, :, :3] if image.ndim == 3 else image[:, :, None]
+    if not any((side == 0).all(axis=-1).any() for side in (colors[0], colors[-1], colors[:, 0], colors[:, -1])):
         return None
-    zero = (gray == 0).view(np.uint8)
+    zero = np.ascontiguousarray((colors == 0).all(axis=-1)).view(np.uint8)
     _, labels, found, _ = cv2.connectedComponentsWithStats(zero, connectivity=4)
-    height, width = gray.shape
     at = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     at = at[(at > 0) & (found[at, cv2.CC_STAT_AREA] >= _SMALLEST_BORDER)]
     if not at.size:
@@ -94,7 +94,7 @@ def black_border(gray: NDArray[Any]) -> NDArray[np.bool_] | None:
     inner = cv2.erode(zero, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     inside = np.bincount(labels[inner > 0], minlength=len(found))
     at = at[inside[at] >= _THICK * found[at, cv2.CC_STAT_AREA]]
-    if not at.size:
+    if not at.size or found[at, cv2.CC_STAT_AREA].sum() == zero.size:  # an image that is black altogether has no border
         return None
     chosen = np.zeros(len(found), np.bool_)
     chosen[at] = True

@@ -50,8 +50,10 @@ _ERRORS = 3.0  # standard errors that are added to those
 _TURN, _TURN_SPREAD = 8.0, 12.0  # degrees
 _INSIDE, _OUTSIDE = 0.2, 0.8  # shares of the points that lie in the range, and would if the views were exchanged
 _CLIPPED, _FEWEST_CLIPPED, _SLACK = 0.03, 6, 1.5  # share, points and pixels beyond an end of the range
-_MANY = 150  # features of either view of which two views of one scene have a majority in common
-_FEW_AGREE = 0.25
+_FEW = 0.15  # of the features, that agree where both views are of one scene and neither is mirrored
+_LARGE_ROLL = 1.0  # degrees beyond which disparities are not what they will be
+_MANY = 150  # features of either view that two views of one scene have many of in common
+_FEW_AGREE, _FEW_MATCHES = 0.25, 0.04
 _BRIGHTER, _SHARPER = 1.5, 1.4
 _BLANK, _WHITE = 0.5, 0.3
 _PATCH = 7  # side of the patch whose brightness is compared, pixels
@@ -184,16 +186,21 @@ def check_gray(pair: GrayPair, min_disparity: int, max_disparity: int, *, quick:
     faults: list[Fault] = []
     if same_pixels(pair.left, pair.right):
         faults.append(_fault("same", "left and right hold the same pixels: was one view given twice?"))
-    elif known is None:
-        faults += _apart(mine, matches, right, factor, pair, rows)
     else:
-        faults += _of_disparities(matches, known, min_disparity, max_disparity)
-        faults += _of_rows(known, height, width)
+        few = _FEW * min(len(mine.angles), len(theirs.angles))
+        if known is None or known.agreeing.sum() < few:
+            faults += _apart(mine, matches, right, factor, pair, rows)
+            if faults and faults[0].kind != "rows":
+                known = None
+        if known is not None:
+            faults = _of_rows(known, height, width)
+            if abs(known.roll_degrees) < _LARGE_ROLL:
+                faults += _of_disparities(matches, known, min_disparity, max_disparity)
     places = (matches.left[known.agreeing], matches.right[known.agreeing]) if known is not None else None
     brightness = _brightness(pair, places)
-    sharpness = _sharpness(right) / _sharpness(left) if known is not None else 1.0
+    sharpness = _sharpness(right) / _sharpness(left)
     blank, white = _blank(left), _saturated(pair.left)
-    faults += _of_light(brightness, sharpness, blank, white)
+    faults += _of_light(brightness, sharpness if not faults or known is not None else 1.0, blank, white)
     order = list(KINDS)
     faults.sort(key=lambda fault: order.index(fault.kind))
     seen: dict[str, Any] = {}
@@ -209,7 +216,7 @@ def check_gray(pair: GrayPair, min_disparity: int, max_disparity: int, *, quick:
 
 
 def same_pixels(left: Any, right: Any) -> bool:
-    """Return whether two images, or parts of images, hold the same pixels; their first rows mostly tell."""
+    """Return whether two images, or parts of images, have equal pixels; mostly the first rows decide."""
     a, b = np.asarray(left), np.asarray(right)
     return a.shape == b.shape and bool(np.array_equal(a[:1], b[:1])) and bool(np.array_equal(a, b))
 
@@ -293,22 +300,28 @@ def _apart(
 ) -> list[Fault]:  # fmt: skip
     """Return why the rows of two views cannot be told."""
     height, width = pair.left.shape
-    turn, share = _turn(matches)
-    if share >= _MAJORITY and abs(turn) > _TURN:
-        return [_fault("rotated", f"one view is turned by about {turn:+.0f} degrees to the other: turn it back")]
     usable = _usable(pair.right_bad, right.shape)
     flipped = None if usable is None else np.ascontiguousarray(usable[:, ::-1])
     mirror = points_of(np.ascontiguousarray(right[:, ::-1]), factor, flipped)
     mirrored = match_points(mine, mirror)
-    level = fit_rows(mirrored, height, width, _TOLERANCE / factor)
-    if level is not None and level.share >= _MAJORITY and level.agreeing.sum() > 2 * FEWEST:
-        return [_fault("mirrored", "one view is mirrored, left to right: mirror it back")]
     turn, share = _turn(mirrored)
-    if share >= _MAJORITY and len(mirrored.turns) > max(2 * FEWEST, len(matches.turns)):
-        how = "top to bottom" if abs(abs(turn) - 180) < 2 * _TURN_SPREAD else f"and turned by {turn:+.0f} degrees"
+    if share >= _MAJORITY and share * len(mirrored.turns) > max(2 * FEWEST, 1.5 * _consistent(matches)):
+        if abs(turn) < _TURN:
+            how = "left to right"
+        else:
+            how = "top to bottom" if abs(abs(turn) - 180) < _TURN else f"and turned by {turn:+.0f} degrees"
         return [_fault("mirrored", f"one view is mirrored, {how}: mirror it back")]
+    turn, share = _turn(matches)
+    if share >= _MAJORITY and abs(turn) > _TURN and share * len(matches.turns) > 2 * FEWEST:
+        return [_fault("rotated", f"one view is turned by about {turn:+.0f} degrees to the other: turn it back")]
+    if rows is not None and rows.share >= _MAJORITY:
+        return []
+    features = min(len(mine.angles), len(mirror.angles))
+    agree = 0 if rows is None else int(rows.agreeing.sum())
+    if features >= _MANY and agree < _FEW_MATCHES * features and (rows is None or rows.share < _FEW_AGREE):
+        return [_fault("unrelated", "the views have hardly a point in common: are they of the same scene and moment?")]
     loose = fit_rows(matches, height, width, 0.02 * width)
-    if loose is not None and loose.share >= _MAJORITY:
+    if loose is not None and loose.share >= _MAJORITY and loose.agreeing.sum() > 2 * FEWEST:
         return [
             _fault(
                 "rows",
@@ -316,10 +329,12 @@ def _apart(
                 "them best: rectify the pair (and are both views of the same moment?)",
             )
         ]
-    share = 0.0 if rows is None else rows.share
-    if min(len(mine.angles), len(mirror.angles)) >= _MANY and share < _FEW_AGREE:
-        return [_fault("unrelated", "the views have hardly a point in common: are they of the same scene and moment?")]
     return []
+
+
+def _consistent(matches: Matches) -> float:
+    """Return how many points are turned alike."""
+    return _turn(matches)[1] * len(matches.turns)
 
 
 def _turn(matches: Matches) -> tuple[float, float]:
@@ -382,7 +397,9 @@ def _of_light(brightness: float, sharpness: float, blank: float, white: float) -
             _fault("sharpness", f"the {blurred} view is the less sharp one: is it out of focus, or scaled up?")
         )
     if blank > _BLANK:
-        faults.append(_fault("blank", f"{100 * blank:.0f} % of the left view has no texture, where nothing is measured"))
+        faults.append(
+            _fault("blank", f"{100 * blank:.0f} % of the left view has no texture, where nothing is measured")
+        )
     if white > _WHITE:
         faults.append(_fault("saturated", f"{100 * white:.0f} % of the left view is white: expose it less"))
     return faults

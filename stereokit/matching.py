@@ -27,11 +27,14 @@ from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
+from stereokit.options import MatchOptions, StageOptions
 from stereokit.pipeline import CpuPipeline, Pipeline, concluded, with_blank
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from stereokit.cuda.pipeline import DeviceDisparity
 
 __all__ = ["METHODS", "Matcher", "match", "warmup"]
@@ -93,7 +96,7 @@ class Matcher:
     def __init__(
         self, method: str = "census+sgm", *, max_disparity: int = 128, min_disparity: int = 0, scale: float = 1.0,
         refiner: str | Callable[..., Disparity] | None = None, device: str = "auto", threads: int | None = None,
-        **options: Any,
+        **options: Unpack[StageOptions],
     ) -> None:  # fmt: skip
         if not isinstance(device, str) or device not in ("auto", "cpu", "cuda"):
             raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {shown(device)}")
@@ -106,7 +109,7 @@ class Matcher:
             min_disparity=min_disparity,
             scale=scale,
             refiner=refiner,
-            options=options,
+            options={**options},
         )
         self._pipeline: Pipeline = _pipeline(settings, device)
         self._watch = PairWatch()
@@ -395,8 +398,9 @@ _matchers_lock = threading.Lock()
 
 
 def match(
-    left: Any, right: Any, /, method: str = "census+sgm", *, mask: Any = None, right_mask: Any = None, **options: Any
-) -> NDArray[np.float32]:
+    left: Any, right: Any, /, method: str = "census+sgm", *, mask: Any = None, right_mask: Any = None,
+    **options: Unpack[MatchOptions],
+) -> NDArray[np.float32]:  # fmt: skip
     """Match a rectified pair and return the left view's disparity map.
 
     The map is **filled**: where nothing was measured it holds what its surroundings make likely. ``fill=None`` leaves
@@ -424,15 +428,16 @@ def match(
     InputError, OptionError
         If an image or an option cannot be used.
     """
-    if options.pop("right", False) is not False:
+    values: dict[str, Any] = {**options}
+    if values.pop("right", False) is not False:
         raise OptionError("right must be False here, where only the left view's map is returned; see Matcher")
     try:
-        key = (method, tuple((name, type(options[name]), _file_version(options[name])) for name in sorted(options)))
+        key = (method, tuple((name, type(values[name]), _file_version(values[name])) for name in sorted(values)))
         hash(key)
     except TypeError:
-        return Matcher(method, **options)(left, right, mask=mask, right_mask=right_mask).disparity
+        return Matcher(method, **values)(left, right, mask=mask, right_mask=right_mask).disparity
     with _matchers_lock:
-        matcher = _matchers.pop(key, None) or Matcher(method, **options)
+        matcher = _matchers.pop(key, None) or Matcher(method, **values)
         _matchers[key] = matcher  # the most recently used is last
         while len(_matchers) > 4:
             _matchers.pop(next(iter(_matchers)))

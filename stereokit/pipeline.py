@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Pair, takes_8_bits
+from stereokit.costs.rows import CostInput, takes_8_bits
 from stereokit.errors import OptionError
 from stereokit.images.evidence import blank_pixels, joined
 from stereokit.images.gray import GrayPair
@@ -23,7 +23,7 @@ from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.chain import post_process
 from stereokit.result import Disparity
-from stereokit.selection.wta import winners_like
+from stereokit.selection.wta import selection_output
 from stereokit.settings import Detail, MatchSettings
 
 __all__ = ["CpuPipeline", "Pipeline", "concluded", "refined", "with_blank"]
@@ -174,7 +174,7 @@ class CpuPipeline:
         shape = pair.left.shape
         with span("prepare", "prepare cost"):
             rows = cost.prepare(
-                Pair(
+                CostInput(
                     pair.left,
                     pair.right,
                     joined(pair.left_bad, pair.left_blank),
@@ -191,7 +191,7 @@ class CpuPipeline:
         total = workspace.array("match.cost", shape, aggregation.total_dtype)
         confidence = np.empty(shape, np.float32) if settings.detail >= Detail.CONFIDENCE else None
         candidates = np.empty((2, *shape), np.float32) if settings.detail >= Detail.CANDIDATES else None
-        out = winners_like(
+        out = selection_output(
             disparity, total, confidence, levels.count, levels.minimum, settings.subpixel, settings.uniqueness,
             candidates,
         )  # fmt: skip

@@ -85,6 +85,12 @@ class Disparity:
             f"Disparity({height}x{width}, {span}, {100 * self.density:.1f} % measured{''.join(f', {m}' for m in more)})"
         )
 
+    def _repr_png_(self) -> bytes:
+        """Return the map in colours, as notebooks show it."""
+        good, data = cv2.imencode(".png", self.color()[:, :, ::-1])
+        assert good
+        return data.tobytes()
+
     @property
     def measured(self) -> NDArray[np.float32]:
         """The map of what was measured alone, (H, W) float32 in pixels: NaN where a value was filled in, or is missing.

@@ -15,7 +15,8 @@ from stereokit.defaults import defaults_of
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean, shown
 from stereokit.images.check import check_flag, check_integer, check_names, check_nodata, check_number
 from stereokit.methods import check_levels, current_names, find_refiner, option_names, parse_method
-from stereokit.postprocess.chain import Chain
+from stereokit.options import opencv_hint
+from stereokit.postprocess.chain import PostProcessing
 from stereokit.postprocess.fill import FILLS
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
@@ -161,6 +162,8 @@ class MatchSettings:
         cost_name, aggregation_name = method.split("+")
         make_cost, make_aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         cost_names, aggregation_names = option_names(make_cost), option_names(make_aggregation)
+        if (hint := opencv_hint(options)) is not None:
+            raise OptionError(hint)
         check_names("option", options, sorted({*_PIPELINE, *cost_names, *aggregation_names, *refiner_options}))
         values = {**defaults_of(method, half=scale != 1), **options}
         cost = make_cost(**{k: values[k] for k in cost_names if k in values})
@@ -210,9 +213,9 @@ class MatchSettings:
         needed = self.confidence or bool(getattr(self.refiner, "needs_confidence", False))
         return Detail.CONFIDENCE if needed else Detail.DISPARITY
 
-    def post_processing(self, pixels: int) -> Chain:
+    def post_processing(self, pixels: int) -> PostProcessing:
         """Return the post-processing of a selected map of so many pixels."""
-        return Chain(self.smp, int(self.speckle * pixels), self.fill, self.median, self.matched_levels.minimum)
+        return PostProcessing(self.smp, int(self.speckle * pixels), self.fill, self.median, self.matched_levels.minimum)
 
     def replaced(self, **changes: Any) -> MatchSettings:
         """Return settings that differ in some values."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume, takes_8_bits
+from stereokit.costs.rows import Cost, CostInput, Levels, VolumeRows, produce_volume, takes_8_bits
 from stereokit.errors import InputError, OptionError
 from stereokit.images.check import check_integer, check_nodata, check_number, writable
 from stereokit.images.gray import gray_pair
@@ -22,7 +22,7 @@ from stereokit.images.resize import smooth as smoothed
 from stereokit.kernels.threads import available_threads
 from stereokit.kernels.workspace import Workspace
 from stereokit.methods import build_aggregation, build_cost, check_levels, current_names
-from stereokit.selection.wta import winners_like
+from stereokit.selection.wta import selection_output
 
 __all__ = ["aggregate", "cost_volume"]
 
@@ -71,7 +71,7 @@ def cost_volume(
     share = None if border_cost is None else check_number("border_cost", border_cost, 0, 1)
     sigma = check_number("smooth", smooth, 0, 10)
     gray = smoothed(gray_pair(left, right, check_nodata(nodata)), sigma, eight_bits=takes_8_bits(stage))
-    pair = Pair(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
+    pair = CostInput(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
     return produce_volume(stage.prepare(pair, Workspace(), count), gray.left.shape, levels, count)
 
 
@@ -130,7 +130,7 @@ def aggregate(
     total_dtype = np.dtype(np.float32) if floats else np.dtype(stage.total_dtype)
     total = np.empty((height, width, levels.padded), total_dtype)
     maps = np.empty((height, width), np.float32), np.empty((height, width), total_dtype)
-    out = winners_like(*maps, None, depth, 0, False)
+    out = selection_output(*maps, None, depth, 0, False)
     rows = [VolumeRows(writable(volume), levels.padded)] * max(2, count)
     keywords: dict[str, Any] = {}
     if floats:

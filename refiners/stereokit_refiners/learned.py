@@ -52,7 +52,7 @@ PRECISIONS = ("fp32", "bf16", "int8")
 _KEPT = 4  # compiled networks
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
 
-Run = Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]
+Run = Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]
 """From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
 
 
@@ -439,7 +439,7 @@ class _Compiled:
         self._lock = threading.Lock()
         self.warned = False
 
-    def run(self, inputs: dict[str, NDArray[np.float32]], threads: int) -> NDArray[np.float32]:
+    def run(self, inputs: dict[str, NDArray[Any]], threads: int) -> NDArray[np.float32]:
         """Return the head for encoded inputs."""
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)

@@ -49,8 +49,8 @@ def weights(
     floats = dt.mode == "sum"
     edges, dtype = (_edges_sum, np.float32) if floats else (_edges_rf, np.int16)
     tables = dt.weights(dtype, cost_max)[number]
-    row = queue.once(f"dt.{dt.mode}.row{number}", (dt, cost_max), lambda: tables.row)
-    column = queue.once(f"dt.{dt.mode}.column{number}", (dt, cost_max), lambda: tables.column)
+    row = queue.cached(f"dt.{dt.mode}.row{number}", (dt, cost_max), lambda: tables.row)
+    column = queue.cached(f"dt.{dt.mode}.column{number}", (dt, cost_max), lambda: tables.column)
     rows = queue.array(f"dt.{dt.mode}.rows", height * width, dtype)
     columns = queue.array(f"dt.{dt.mode}.columns", height * width, dtype)
     blocks = blocks_for(height * width, edges.block)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.aggregation._paths import Penalties
+from stereokit.aggregation.paths.penalties import Penalties
 from stereokit.aggregation.sgm import Sgm
 from stereokit.costs.rows import Cost
 from stereokit.cuda.kernel import (
@@ -338,7 +338,7 @@ def aggregate(
     per_block = 128 // lanes
     others = sgm.paths - 1
     rows, blocks = _table(sgm.paths, shape, per_block)
-    table = queue.once("sgm.table", (sgm.paths, shape, padded), lambda: rows)
+    table = queue.cached("sgm.table", (sgm.paths, shape, padded), lambda: rows)
     stored = queue.array("sgm.paths", others * shape[0] * shape[1] * padded // 4, np.uint32)
     numbers = [int(step) for step in steps]
     queue.launch(paths_kernel(padded), blocks, costs, guide, table, others, stored, *shape, *numbers)

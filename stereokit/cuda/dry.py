@@ -56,7 +56,7 @@ class DryQueue:
         """Note a resident array with the size of `values`."""
         return self.array(name, values.size, values.dtype)
 
-    def once(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> SizedArray:
+    def cached(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> SizedArray:
         """Note a resident table."""
         return self.upload(name, make())
 

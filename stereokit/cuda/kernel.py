@@ -166,7 +166,7 @@ class Queue(Protocol):
     def upload(self, name: str, values: np.ndarray[Any, Any]) -> Any:
         """Return the resident flat array called `name` with a copy of `values` in it."""
 
-    def once(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> Any:
+    def cached(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> Any:
         """Return the resident copy of a table, uploaded when `key` is not that of the last call."""
 
     def view(self, held: Any, dtype: Any) -> Any:

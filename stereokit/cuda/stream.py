@@ -88,7 +88,7 @@ class DeviceQueue:
         copied.record(self.stream)
         return held
 
-    def once(self, name: str, key: Any, make: Callable[[], NDArray[Any]]) -> Any:
+    def cached(self, name: str, key: Any, make: Callable[[], NDArray[Any]]) -> Any:
         """Return the resident copy of a table, uploaded when `key` is not that of the last call."""
         if name not in self._arrays or self._keys.get(name) != key:
             values = np.ascontiguousarray(make()).reshape(-1)

@@ -271,7 +271,7 @@ def smooth(queue: Queue, images: Any, dtype: np.dtype[Any], sigma: float, shape:
     """Return both images blurred, 16 bit, as `stereokit.images.resize.smooth` does; `sigma` is above 0."""
     height, width = shape
     size = 2 * height * width
-    weights = queue.once("smooth.weights", sigma, lambda: gaussian_weights(sigma))
+    weights = queue.cached("smooth.weights", sigma, lambda: gaussian_weights(sigma))
     half = gaussian_weights(sigma).size // 2
     rows = queue.array("smooth.rows", size, np.uint32)
     out = queue.array("smooth.out", size, np.uint16)

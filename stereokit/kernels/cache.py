@@ -1,6 +1,6 @@
-"""Where compiled kernels are kept from one process to the next: numba's cache, but nothing in it keeps one from work.
+"""Cache of compiled kernels from one process to the next: numba's own, but no fault of it stops a kernel.
 
-They are where numba keeps what it compiles: in the folder that ``NUMBA_CACHE_DIR`` names, beside the source, or in the
+Its files lie where numba puts them: in the folder that ``NUMBA_CACHE_DIR`` names, beside the source, or in the
 user's cache. Where none of these can be written, as in a read-only container, one that has them is read; kernels that
 none has go to a folder of temporary files that is the user's alone, and where that cannot be either, they are compiled
 again in every process. A file of the cache that is damaged (a full disk, a power cut) counts as absent, and is written
@@ -45,8 +45,8 @@ def _temporary_folder() -> Path | None:
             return None
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if not stat.S_ISDIR(found.st_mode) or (user is not None and (found.st_uid != user or found.st_mode & 0o077)):
+        status = folder.lstat()
+        if not stat.S_ISDIR(status.st_mode) or (user is not None and (status.st_uid != user or status.st_mode & 0o077)):
             return None
         tempfile.TemporaryFile(dir=folder).close()
     except OSError:

@@ -40,7 +40,7 @@ def _look(typing: Any, words: Any, index: Any) -> Any:
 
 @intrinsic
 def _pause(typing: Any, looks: Any) -> Any:
-    """Wait a moment, longer after many `looks`; on Windows the processor is kept."""
+    """Wait a moment, longer after many `looks`; on Windows it yields the processor to nobody."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def call(name: str, result: Any) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stereokit.costs import Census, Zncc, census_cuda, zncc_cuda
-from stereokit.costs.rows import Levels, Pair, produce_volume
+from stereokit.costs.rows import CostInput, Levels, produce_volume
 from stereokit.costs.rows_cuda import Scene
 from stereokit.kernels.workspace import Workspace
 
@@ -30,7 +30,7 @@ def check_volume(
     left[1:5, 2 : shape[1] // 2] = 77
     bad = rng.random((2, *shape)) < 0.1
     masks = tuple(bad) if masked else (None, None)
-    rows = cost.prepare(Pair(left, right, *masks, levels, outside, 1, ranges), Workspace(), 1)
+    rows = cost.prepare(CostInput(left, right, *masks, levels, outside, 1, ranges), Workspace(), 1)
     want = produce_volume(rows, shape, levels, 1)
     images = queue.upload("images", np.stack([left, right]))
     known = queue.upload("bad", bad.view(np.uint8)) if masked else queue.array("bad", 1, np.uint8)

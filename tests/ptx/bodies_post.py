@@ -8,7 +8,7 @@ import numpy as np
 
 from stereokit.kernels.workspace import Workspace
 from stereokit.postprocess import fill, median, remove_speckles, single_matching_phase
-from stereokit.postprocess.chain import Chain, post_process
+from stereokit.postprocess.chain import PostProcessing, post_process
 from stereokit.postprocess.chain_cuda import post_process as post_process_cuda
 from stereokit.postprocess.chain_cuda import raise_to
 from stereokit.postprocess.fill_cuda import fill as fill_cuda
@@ -129,11 +129,11 @@ def check_chain(queue: Any, shape: tuple[int, int] = (9, 40)) -> None:
     bad = np.random.default_rng(3).random(shape) < 0.1
     for disparity in (map_of(shape, 4, 0.2), map_of(shape, 4, 1)):
         for chain in (
-            Chain(True, 3, "background", 3, -2.0),
-            Chain(True, 3, "nearest", 5, -2.0),
-            Chain(False, 0, "background", 0, -2.0),
-            Chain(True, 2, None, 3, -2.0),
-            Chain(False, 0, None, 0, -2.0),
+            PostProcessing(True, 3, "background", 3, -2.0),
+            PostProcessing(True, 3, "nearest", 5, -2.0),
+            PostProcessing(False, 0, "background", 0, -2.0),
+            PostProcessing(True, 2, None, 3, -2.0),
+            PostProcessing(False, 0, None, 0, -2.0),
         ):
             for flags in (None, bad):
                 held = disparity.flatten()

@@ -14,7 +14,7 @@ from stereokit.costs.rows import Levels, VolumeRows
 from stereokit.costs.rows_cuda import pad_levels
 from stereokit.kernels.workspace import Workspace
 from stereokit.selection import wta_cuda
-from stereokit.selection.wta import keys_of, select_row, winners_like
+from stereokit.selection.wta import keys_of, select_row, selection_output
 
 LOWEST = -3
 
@@ -43,7 +43,7 @@ def _winners(
     sure: np.ndarray, disparity: np.ndarray, cost: np.ndarray, count: int, subpixel: bool, least: float
 ) -> Any:
     """Return what the CPU writes to: `sure` is its confidence and the two candidates."""
-    return winners_like(disparity, cost, sure[0], count, LOWEST, subpixel, least, sure[1:])
+    return selection_output(disparity, cost, sure[0], count, LOWEST, subpixel, least, sure[1:])
 
 
 def check_paths(

@@ -47,7 +47,7 @@ class EmulatedQueue:
         held.known[:] = 1
         return held
 
-    def once(self, name: str, key: Any, make: Callable[[], np.ndarray]) -> Buffer:
+    def cached(self, name: str, key: Any, make: Callable[[], np.ndarray]) -> Buffer:
         """Return the array called `name`, made anew when the key changes."""
         if self._keys.get(name, self) != key:
             self.upload(name, make())

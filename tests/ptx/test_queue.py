@@ -114,7 +114,7 @@ def test_tables_are_uploaded_once_for_a_key(fake):
         return np.full((2, 2), value, np.int32)
 
     for value in (1, 1, 2, 2):
-        held = queue.once("table", value, lambda value=value: make(value))
+        held = queue.cached("table", value, lambda value=value: make(value))
         np.testing.assert_array_equal(held.values, [value] * 4)
     assert made == [1, 2]
 

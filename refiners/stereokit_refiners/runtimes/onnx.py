@@ -182,7 +182,7 @@ def _mixture(ops: _OnnxOps, head: str, coarse: str, candidates: str) -> str:
 
 def session(
     network: Network, weights: Weights, threads: int
-) -> Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]:
+) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
     """Return a function from (C, h, w) inputs to the (h, w, C) head that ONNX Runtime computes."""
     import onnxruntime
 
@@ -193,8 +193,8 @@ def session(
     graph = head_graph(network, weights).SerializeToString()
     held = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
-    def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        given = {name: np.ascontiguousarray(inputs[name][None]) for name in network.inputs}
+    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+        given = {name: np.ascontiguousarray(inputs[name][None], np.float32) for name in network.inputs}
         return np.ascontiguousarray(held.run(["head"], given)[0][0])
 
     return run

@@ -100,9 +100,10 @@ def _shuffled(x: Array) -> Array:
     return np.asarray(phases.reshape(channels, 2 * rows, 2 * columns), np.float32)
 
 
-def forward(network: Network, weights: Weights, inputs: dict[str, Array]) -> Array:
+def forward(network: Network, weights: Weights, inputs: dict[str, NDArray[Any]]) -> Array:
     """Return the (h, w, C) head for (C, h, w) inputs."""
-    head = network.forward(_PlainOps(network, weights), inputs)["map"]
+    given = {name: np.asarray(each, np.float32) for name, each in inputs.items()}
+    head = network.forward(_PlainOps(network, weights), given)["map"]
     return np.ascontiguousarray(head.transpose(1, 2, 0))
 
 
@@ -132,12 +133,12 @@ def _weighs(content: WeightFile) -> bool:
     return "evidence" in network_named(content.network).inputs
 
 
-def _prepared(content: WeightFile) -> tuple[dict[str, Array], Callable[[Array], Array]]:
+def _prepared(content: WeightFile) -> tuple[dict[str, NDArray[Any]], Callable[[Array], Array]]:
     """Return a network's inputs for the scene, and what makes a map of its head."""
     network, scene = network_named(content.network), _scene()
     rows, columns = (2 * length for length in SCENE_SIZE)
     if not _weighs(content):
-        inputs = encode(tuple(network.inputs), content.form, **scene)
+        inputs: dict[str, NDArray[Any]] = dict(encode(tuple(network.inputs), content.form, **scene))
 
         def composed(head: Array) -> Array:
             return compose(
@@ -152,7 +153,7 @@ def _prepared(content: WeightFile) -> tuple[dict[str, Array], Callable[[Array], 
     return inputs, lambda head: mixture(head, found, rows, columns)[0]
 
 
-def mistake(content: WeightFile, run: Callable[[dict[str, Array]], Array]) -> float:
+def mistake(content: WeightFile, run: Callable[[dict[str, NDArray[Any]]], Array]) -> float:
     """Return how far a runtime's map of a small scene is off on average, full-size pixels; infinite if not a number.
 
     Parameters

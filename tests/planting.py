@@ -63,6 +63,8 @@ def flawed(source: str, mutant: Mutant) -> ast.Module:
     """
     tree = ast.parse(source)
     old, new = _code(mutant.old), _code(mutant.new)
+    if isinstance(new, list) and not isinstance(old, list):
+        old = [ast.Expr(old)]
     matches = list(_matches(tree, old, mutant.function))
     if len(matches) != 1:
         raise StaleMutant(f"old code must match once in {mutant.module}, got {len(matches)} times: {mutant.old!r}")

@@ -28,7 +28,7 @@ from stereokit.pipeline import refined
 from stereokit.postprocess.chain_cuda import post_process, raise_to
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
-from stereokit.selection.wta_cuda import Maps, doubt
+from stereokit.selection.wta_cuda import Maps, zero_invalid_confidence
 from stereokit.settings import Detail, MatchSettings
 
 __all__ = ["CudaPipeline", "DeviceDisparity", "all_kernels"]
@@ -304,7 +304,9 @@ class CudaPipeline:
         disparity, valid = post_process(queue, maps.disparity, maps.cost, left_bad, chain, shape)
         if settings.detail == Detail.DISPARITY:
             return _Found(disparity, valid), shape
-        queue.launch(doubt, blocks_for(pixels, doubt.block), confidence, valid, pixels)
+        queue.launch(
+            zero_invalid_confidence, blocks_for(pixels, zero_invalid_confidence.block), confidence, valid, pixels
+        )
         return _Found(disparity, valid, confidence, candidates), shape
 
     def _aggregate(self, queue: Queue, scene: Scene, guide: Any, maps: Maps) -> None:

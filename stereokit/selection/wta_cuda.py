@@ -34,7 +34,16 @@ from stereokit.cuda.kernel import (
 )
 from stereokit.selection.wta import margin_of, parabola
 
-__all__ = ["RULES", "Maps", "doubt", "group_of", "lowest_of_group", "select", "select_kernel", "selector"]
+__all__ = [
+    "RULES",
+    "Maps",
+    "group_of",
+    "lowest_of_group",
+    "select",
+    "select_kernel",
+    "selector",
+    "zero_invalid_confidence",
+]
 
 RULES = (i32, i32, i32, f32, i32)
 """Types of the number of levels, the lowest disparity, whether to interpolate, the least margin, and how much to write
@@ -181,7 +190,7 @@ def select_kernel(padded: int, floats: bool) -> Kernel:
 
 
 @kernel(array(f32), array(u8), i32, block=128)
-def doubt(confidence, valid, pixels):  # type: ignore[no-untyped-def]
+def zero_invalid_confidence(confidence, valid, pixels):  # type: ignore[no-untyped-def]
     """Set the confidence of pixels that are not valid to 0."""
     at = u32(cuda.grid(1))
     if at < u32(pixels) and valid[at] == 0:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ptx.emulated import EmulatedQueue
+from ptx.interpreter.emulated import EmulatedQueue
 from stereokit import matching
 from stereokit.cli.app import app
 from stereokit.cuda import pipeline as cuda_pipeline

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
-from ptx.emulated import EmulatedQueue
-from ptx.harness import Buffer
+from ptx.interpreter.emulated import EmulatedQueue
+from ptx.interpreter.harness import Buffer
 from stereokit import Matcher, match_large, matching
 from stereokit.cuda import pipeline as cuda_pipeline
 from stereokit.errors import DeviceError, InputError

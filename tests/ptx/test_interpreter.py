@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ptx import errors
-from ptx.harness import Buffer, run
+from ptx.interpreter import errors
+from ptx.interpreter.harness import Buffer, run
 
 _REGISTERS = ".reg .pred %p<9>; .reg .b16 %rs<9>; .reg .b32 %r<40>; .reg .f32 %f<9>; .reg .b64 %rd<20>;"
 _OWN = """

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ptx.emulated import EmulatedQueue
-from ptx.harness import Report, translation_of
+from ptx.interpreter.emulated import EmulatedQueue
+from ptx.interpreter.harness import Report, translation_of
 from stereokit import Matcher
 from stereokit.cuda.pipeline import CudaPipeline
 from stereokit.defaults import METHODS

@@ -11,10 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from ptx.errors import BadShuffle, Deadlock, DivergentBarrier, KernelError, OutOfBounds, Trap, UnknownInstruction
-from ptx.memory import BASE, MIDDLE, SLOT, Region, Threads
-from ptx.parser import KINDS, LOCAL, SHARED
-from ptx.translate import EXIT, Translation, is_barrier, is_warp_operation, shuffle_table
+from ptx.interpreter.errors import (
+    BadShuffle,
+    Deadlock,
+    DivergentBarrier,
+    KernelError,
+    OutOfBounds,
+    Trap,
+    UnknownInstruction,
+)
+from ptx.interpreter.memory import BASE, MIDDLE, SLOT, Region, Threads
+from ptx.interpreter.parser import KINDS, LOCAL, SHARED
+from ptx.interpreter.translate import EXIT, Translation, is_barrier, is_warp_operation, shuffle_table
 
 __all__ = ["Machine"]
 

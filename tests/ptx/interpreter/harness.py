@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ptx.machine import Machine
-from ptx.memory import Region
-from ptx.parser import parse
-from ptx.translate import Translation
+from ptx.interpreter.machine import Machine
+from ptx.interpreter.memory import Region
+from ptx.interpreter.parser import parse
+from ptx.interpreter.translate import Translation
 
 __all__ = ["CAPABILITY", "Buffer", "Report", "forget", "run", "translation_of"]
 
@@ -121,7 +121,7 @@ def run(
     Raises
     ------
     KernelError
-        One of `ptx.errors`, at the first thing that is wrong.
+        One of `ptx.interpreter.errors`, at the first thing that is wrong.
     """
     made = translation_of(kernel)
     plain = isinstance(kernel, str)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ptx.arithmetic import FUNCTIONS
-from ptx.errors import UnknownInstruction
-from ptx.parser import KINDS, Instruction, Program
+from ptx.interpreter.arithmetic import FUNCTIONS
+from ptx.interpreter.errors import UnknownInstruction
+from ptx.interpreter.parser import KINDS, Instruction, Program
 
 __all__ = ["EXIT", "Translation", "is_barrier", "is_warp_operation"]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ptx.errors import Misaligned, OutOfBounds, Race, Uninitialised
+from ptx.interpreter.errors import Misaligned, OutOfBounds, Race, Uninitialised
 
 __all__ = ["BASE", "MIDDLE", "SLOT", "Region", "Threads"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ptx.harness import Buffer, Report, run
+from ptx.interpreter.harness import Buffer, Report, run
 
 __all__ = ["EmulatedQueue"]
 

@@ -139,9 +139,9 @@ def check_selection_of_floats(queue):
     check_selection(queue, floats=True)
 
 
-def check_doubt(queue):
+def check_zeroed_confidence(queue):
     confidence = np.linspace(0, 1, 200, dtype=np.float32)
     valid = (np.arange(200) % 3 != 0).astype(np.uint8)
     held = queue.upload("confidence", confidence)
-    queue.launch(wta_cuda.doubt, 2, held, queue.upload("valid", valid), confidence.size)
+    queue.launch(wta_cuda.zero_invalid_confidence, 2, held, queue.upload("valid", valid), confidence.size)
     np.testing.assert_array_equal(queue.fetch(held), confidence * valid)

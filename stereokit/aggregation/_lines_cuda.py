@@ -33,8 +33,8 @@ def _make_edges(name: str, weight: Any) -> Kernel:
             row[at] = left
             column[at] = above
 
-    made: Kernel = edges
-    return made
+    result: Kernel = edges
+    return result
 
 
 _edges_rf = _make_edges("dt_edges_rf", i16)

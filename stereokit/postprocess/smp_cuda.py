@@ -62,8 +62,8 @@ def _make_resolve(name: str, cost: Any, bits: Any) -> Kernel:
                 disparity[at] = f32(np.nan)
             x = u32(x + step)
 
-    made: Kernel = resolve
-    return made
+    result: Kernel = resolve
+    return result
 
 
 _resolve_short = _make_resolve("smp_short", u16, _bits_of_short)

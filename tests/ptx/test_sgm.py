@@ -26,7 +26,7 @@ def test_paths(paths):
     [((1, 1), 1), ((1, 7), 2), ((7, 1), 33), ((3, 5), 64), ((4, 3), 65), ((3, 3), 129), ((2, 3), 385)],
 )
 def test_sizes_and_levels(shape, count):
-    checks.check_paths(EmulatedQueue(), Sgm(15, 85, paths=8), shape, count, confident=2)
+    checks.check_paths(EmulatedQueue(), Sgm(15, 85, paths=8), shape, count, detail=2)
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.0])

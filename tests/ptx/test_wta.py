@@ -23,7 +23,7 @@ def test_levels(count, floats):
 
 
 @pytest.mark.parametrize(
-    ("subpixel", "uniqueness", "confident"), [(False, 0.0, 0), (True, 0.0, 1), (True, 20.0, 0), (False, 20.0, 2)]
+    ("subpixel", "uniqueness", "detail"), [(False, 0.0, 0), (True, 0.0, 1), (True, 20.0, 0), (False, 20.0, 2)]
 )
-def test_rules(subpixel, uniqueness, confident):
-    checks.check_selection(EmulatedQueue(), False, (4, 9), 12, subpixel, uniqueness, confident, (0, 1, 9))
+def test_rules(subpixel, uniqueness, detail):
+    checks.check_selection(EmulatedQueue(), False, (4, 9), 12, subpixel, uniqueness, detail, (0, 1, 9))

@@ -269,7 +269,7 @@ def aggregate(
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     dt : Dt
         Options.
     cost : Cost
@@ -283,7 +283,7 @@ def aggregate(
     padded : int
         Levels of the volume.
     maps : Maps
-        Where selection goes.
+        Maps of the selection.
     """
     if dt.mode == "sum":
         aggregate_sum(queue, dt, cost.cost_max, costs, guide, shape, padded, maps)

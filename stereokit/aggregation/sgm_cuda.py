@@ -316,7 +316,7 @@ def aggregate(
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     sgm : Sgm
         Options.
     cost : Cost
@@ -330,7 +330,7 @@ def aggregate(
     padded : int
         Levels of the volume.
     maps : Maps
-        Where selection goes.
+        Maps of the selection.
     """
     penalties: Penalties = sgm.penalties(cost.cost_max, cost.unit)
     steps = penalties.edge, penalties.p1, penalties.p2, penalties.p1_edge, penalties.p2_edge

@@ -1,4 +1,4 @@
-"""What the CUDA twins of the costs share: the layout of the volume, and which cells have no evidence.
+"""Common parts of the costs' CUDA twins: the layout of the volume, and the cells without evidence.
 
 A volume holds four levels to a 32-bit word, ``padded / 4`` words to a pixel: byte b of word w is level ``4 * w + b``.
 Levels that only pad hold 255. A thread computes one word of each pixel of a strip of a row: the right pixels of its
@@ -85,7 +85,7 @@ EVIDENCE = (array(u8), i32, i32, i32, i32, i32, i32, i32)
 
 @device
 def padding(level, count):  # type: ignore[no-untyped-def]
-    """Return what the padding levels of the word that begins with `level` hold: 255 each."""
+    """Return the padding levels of the word that begins with `level`: 255 each."""
     existing = i32(min(max(i32(count - level), i32(0)), i32(4)))
     return u32(0) if existing == 4 else u32(u32(0xFFFFFFFF) << u32(u32(8) * u32(existing)))
 

@@ -150,12 +150,12 @@ def device(function: Callable[..., Any]) -> Any:
 
 
 def blocks_for(threads: int, block: int) -> int:
-    """Return how many blocks make up at least so many threads."""
+    """Return the number of blocks for at least so many threads."""
     return -(-threads // block)
 
 
 class Queue(Protocol):
-    """What the stages run on: a stream of a GPU with the buffers that stay there, or a stand-in for tests.
+    """A stream of a GPU with the buffers that stay there, or a stand-in for tests.
 
     Launches are in order and nobody waits for them; only `fetch` does.
     """

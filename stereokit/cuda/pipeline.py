@@ -143,7 +143,7 @@ class CudaPipeline:
         return CudaPipeline(self.settings.replaced(**changes))
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
-        """Return how many bytes of buffers a pair takes on the device; see `stereokit.pipeline.Pipeline`."""
+        """Return the bytes of buffers that a pair takes on the device; see `stereokit.pipeline.Pipeline`."""
         queue = DryQueue()
         dtype = np.dtype(dtype)
         pixels = height * width
@@ -185,7 +185,7 @@ class CudaPipeline:
         left, right : (H, W) or (H, W, 3) uint8, C-contiguous, with ``__cuda_array_interface__``
             Grey or RGB; not modified.
         stream : stream of numba, PyTorch or CuPy, int, or None
-            Where to run; None is the default stream, which waits for all others that are not made otherwise.
+            Stream of the launches; None is the default stream, which waits for all others unless they were made otherwise.
 
         Raises
         ------
@@ -253,13 +253,13 @@ class CudaPipeline:
         Parameters
         ----------
         queue : Queue
-            Where to run.
+            Queue of launches.
         images : (2 * H * W,) uint8 or uint16 on the device
             Left and right image.
         dtype : numpy dtype
             Their type.
         guide : (H * W,) uint8 on the device
-            What edges are taken from.
+            Image of the edges.
         bad : (2 * H * W,) uint8 on the device, or None
             Not 0 where a pixel has no evidence.
         shape : (int, int)
@@ -318,7 +318,7 @@ class CudaPipeline:
 
     @property
     def _refine(self) -> Any:
-        """What refines on the device, `stereokit_refiners.contract.DeviceRefiner`, or None."""
+        """The refiner on the device, `stereokit_refiners.contract.DeviceRefiner`, or None."""
         return getattr(self.settings.refiner, "on_device", None)
 
 

@@ -100,10 +100,10 @@ def fill(queue: Queue, disparity: Any, mode: str | None, empty_value: float, sha
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
     mode : {"background", "nearest"} or None
-        Which end of a gap fills it; None fills empty_value.
+        Rule of filling; None leaves gaps.
     empty_value : float
         Disparity of a filled map in which no pixel was valid.
     shape : (int, int)

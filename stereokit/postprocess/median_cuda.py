@@ -87,7 +87,7 @@ def median(queue: Queue, disparity: Any, size: int, shape: tuple[int, int]) -> A
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
     size : {3, 5}
         Side of the window in pixels.

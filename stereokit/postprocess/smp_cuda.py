@@ -76,7 +76,7 @@ def resolve(queue: Queue, disparity: Any, cost: Any, shape: tuple[int, int]) -> 
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
     cost : (H * W,) uint16 or float32
         Aggregated cost of each pixel's match.

@@ -51,7 +51,7 @@ RULES = (i32, i32, i32, f32, i32)
 
 
 class Maps(NamedTuple):
-    """What selection writes and by which rules; the last arguments of kernels that select.
+    """Maps of the selection and its rules; the last arguments of kernels that select.
 
     The maps are flat, ``(H * W)`` on the device; `confidence` has one element where nobody asked for it, and thrice as
     many with candidates: behind it lie the winners again, and the best that are not next to them.
@@ -68,7 +68,7 @@ class Maps(NamedTuple):
 
 
 def group_of(padded: int) -> tuple[int, int]:
-    """Return how many lanes share the levels of a pixel, and how many levels each of them has."""
+    """Return the number of lanes that share the levels of a pixel, and the levels of each."""
     lanes = min(32, padded // 4)
     return lanes, padded // lanes
 

@@ -1,4 +1,4 @@
-"""The interpreter itself: what instructions compute, and that each kind of failure is found and named."""
+"""The interpreter itself: results of instructions, and every kind of failure by its name."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def program(body, shared=0):
 
 
 def apply(body, values, dtype=np.uint32):
-    """Return what ``%r5 -> %r6`` makes of each value."""
+    """Return the result of ``%r5 -> %r6`` for each value."""
     values = np.asarray(values, dtype)
     values = np.resize(values, -(-values.size // 32) * 32)
     out = np.zeros(values.size, np.uint32)

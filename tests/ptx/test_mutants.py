@@ -1,4 +1,4 @@
-"""Every planted flaw is found by its check, which passes on the real module; and planting leaves no trace."""
+"""Every planted flaw is caught as its kind says by a check that passes on the real module; planting leaves no trace."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ NAME = "zero_invalid_confidence"
 
 @cache
 def _how_real(module: str, check: str) -> str:
-    """Return how a check fails when the module is imported anew as it is."""
-    return how_caught(Mutant("", module, "__all__ = _1", "__all__ = _1", "", check), **table.SIZES.get(check, {}))
+    """Return the failure of a check when the module is imported anew as it is."""
+    text = "from __future__ import annotations"
+    return how_caught(Mutant("", module, text, text, "", check), **table.SIZES.get(check, {}))
 
 
 def _state() -> tuple[object, ...]:
-    """Return what planting touches."""
+    """Return the modules, attributes and kernels that planting touches."""
     names = [name for name in sys.modules if name.startswith(("stereokit", "ptx"))]
     modules = {name: sys.modules[name] for name in names}
     attributes = {name: dict(vars(module)) for name, module in modules.items() if hasattr(module, "__path__")}

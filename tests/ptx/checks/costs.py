@@ -36,9 +36,9 @@ def check_volume(
     known = queue.upload("bad", bad.view(np.uint8)) if masked else queue.array("bad", 1, np.uint8)
     pair = DevicePair(images, np.dtype(dtype), known, masked, *shape, levels, outside, ranges)
     module = census_cuda if isinstance(cost, Census) else zncc_cuda
-    found = queue.fetch(queue.view(module.volume(queue, cost, pair), np.uint8)).reshape(*shape, pair.padded)
-    np.testing.assert_array_equal(found[:, :, : levels.count], want)
-    assert (found[:, :, levels.count :] == 255).all()
+    costs = queue.fetch(queue.view(module.volume(queue, cost, pair), np.uint8)).reshape(*shape, pair.padded)
+    np.testing.assert_array_equal(costs[:, :, : levels.count], want)
+    assert (costs[:, :, levels.count :] == 255).all()
 
 
 def check_census(queue):

@@ -42,7 +42,7 @@ def _compare(queue: Any, maps: Any, disparity: np.ndarray, cost: np.ndarray, sur
 def _winners(
     sure: np.ndarray, disparity: np.ndarray, cost: np.ndarray, count: int, subpixel: bool, least: float
 ) -> Any:
-    """Return what the CPU writes to: `sure` is its confidence and the two candidates."""
+    """Return the maps for the CPU: `sure` is its confidence and the two candidates."""
     return selection_output(disparity, cost, sure[0], count, LOWEST, subpixel, least, sure[1:])
 
 
@@ -52,7 +52,7 @@ def check_paths(
 ) -> None:  # fmt: skip
     """Compare the maps of random costs with a patch of equal ones, on a guide with edges around the threshold.
 
-    Where `steep`, all levels but one are as dear as can be, and path costs grow along the paths to their largest.
+    Where `steep`, all levels but one have the largest cost, and path costs grow along the paths to their largest.
     """
     rng = np.random.default_rng(0)
     cost = Census("5x5")
@@ -142,6 +142,6 @@ def check_selection_of_floats(queue):
 def check_zeroed_confidence(queue):
     confidence = np.linspace(0, 1, 200, dtype=np.float32)
     valid = (np.arange(200) % 3 != 0).astype(np.uint8)
-    held = queue.upload("confidence", confidence)
-    queue.launch(wta_cuda.zero_invalid_confidence, 2, held, queue.upload("valid", valid), confidence.size)
-    np.testing.assert_array_equal(queue.fetch(held), confidence * valid)
+    on_device = queue.upload("confidence", confidence)
+    queue.launch(wta_cuda.zero_invalid_confidence, 2, on_device, queue.upload("valid", valid), confidence.size)
+    np.testing.assert_array_equal(queue.fetch(on_device), confidence * valid)

@@ -51,7 +51,7 @@ class _Queue(EmulatedQueue):
 
 
 def how_caught(mutant: Mutant, **options: Any) -> str:
-    """Return how the check fails on the mutant; "" if it passes.
+    """Return the failure of the check on the mutant, in words; "" if it passes.
 
     It is "wrong result" or a class of `ptx.interpreter.errors` in words.
 

@@ -27,7 +27,7 @@ OUTCOMES = {
     _BORDER: {"wrong result"},
     _RULE: {"wrong result"},
 }
-"""How a mutant of each kind may be caught."""
+"""Outcomes by which a mutant of each kind may be caught."""
 
 SIZES: dict[str, dict[str, Any]] = {
     "dt.check_rf": {"shapes": ((9, 33, 8), (17, 1, 1))},
@@ -181,7 +181,7 @@ MUTANTS = [
     ),
     Mutant(
         "the neighbor above comes from the wrong lane", "selection.wta_cuda",
-        "behind = values[k + 1] if k < held - 1 else above", "behind = values[k + 1] if k < held - 1 else below",
+        "behind = values[k + 1] if k < count - 1 else above", "behind = values[k + 1] if k < count - 1 else below",
         _SHUFFLE, "sgm.check_selection",
     ),
     Mutant(

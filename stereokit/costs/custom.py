@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from stereokit.costs.rows import Pair, VolumeRows
+from stereokit.costs.rows import CostInput, VolumeRows
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer
 from stereokit.kernels.threads import run, spans
@@ -61,18 +61,18 @@ class RowCost:
         return True
 
     @property
-    def dear(self) -> bool:
+    def costly_to_recompute(self) -> bool:
         """Whether a row costs more to compute again than to bring back from a volume."""
         return False
 
-    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[VolumeRows]:
+    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[VolumeRows]:
         """Compute the cost volume; return its rows for `workers` sweeps."""
         height, width = pair.left.shape
         levels = pair.levels
         volume = workspace.array("custom.volume", (height, width, levels.count), np.uint8)
-        worst = np.uint8(self.cost_max if pair.outside is None else round(pair.outside * self.cost_max))
+        border_cost = np.uint8(self.cost_max if pair.outside is None else round(pair.outside * self.cost_max))
         columns = np.arange(width)[:, None] - np.arange(levels.count)[None, :] - levels.minimum
-        outside = (columns < 0) | (columns >= width)
+        no_match = (columns < 0) | (columns >= width)
         margin = 0
         left, right = pair.left, pair.right
         if pair.outside is None:  # the function sees images that go on with their border pixels
@@ -88,11 +88,11 @@ class RowCost:
                     row[:] = wide[margin : margin + width]
                 else:
                     self.function(left, right, y, levels.minimum, row)
-                    np.copyto(row, worst, where=outside)
+                    np.copyto(row, border_cost, where=no_match)
                 if pair.right_bad is not None:
-                    np.copyto(row, worst, where=pair.right_bad[y, np.clip(columns, 0, width - 1)])
+                    np.copyto(row, border_cost, where=pair.right_bad[y, np.clip(columns, 0, width - 1)])
                 if pair.left_bad is not None:
-                    row[pair.left_bad[y]] = worst
+                    row[pair.left_bad[y]] = border_cost
 
         run([partial(fill, y0, y1) for y0, y1 in spans(height, pair.threads)], pair.threads)
         return [VolumeRows(volume, levels.padded)] * workers

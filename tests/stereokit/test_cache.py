@@ -27,9 +27,9 @@ USE = """
         import numpy as np
         import stereokit
         from stereokit.postprocess.fill import fill
-        from stereokit_refiners.runtimes.compose import compose
+        from stereokit_refiners.outputs import Direct
         filled = fill(np.array([[np.nan, 3, np.nan]], np.float32))
-        full = compose("cnn", "literal", np.full((1, 1, 4), 0.5, np.float32), None, 2, 2, 1)
+        full = Direct().map(np.full((1, 1, 4), 0.5, np.float32), np.zeros((1, 1), np.float32), 2, 2)
     assert filled.tolist() == [[3, 3, 3]] and full.tolist() == [[128, 128]] * 2
     print(stereokit.__file__, [str(w.message) for w in caught if w.category is RuntimeWarning], sep="\\n")
     """
@@ -187,6 +187,7 @@ def test_names_of_kernels_change_with_what_is_compiled_and_nothing_else():
         if re.search(r"^@(inline|kernel|by_types)\b", path.read_text("utf-8"), re.MULTILINE)
         and not path.stem.endswith("_cuda")  # these are compiled in memory
     }
-    assert {"costs/census.py", "aggregation/_paths.py"} <= makers <= sources
-    assert {"kernels/simd.py", "images/check.py"} <= sources  # imported by these
+    assert {"costs/census.py", "aggregation/paths/visits.py", "aggregation/paths/steps.py"} <= makers <= sources
+    simd = {f"kernels/simd/{name}.py" for name in ("__init__", "types", "memory", "arithmetic", "shuffle")}
+    assert simd | {"images/check.py"} <= sources  # imported by these
     assert not sources & {"matching.py", "calibration.py", "cli/match.py", "result.py"}

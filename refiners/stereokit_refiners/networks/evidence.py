@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from stereokit_refiners.networks.layers import Layer, Ops
+from stereokit_refiners.outputs import Output
 
 __all__ = ["CHANNELS", "GAINS", "LOGITS", "STEPS", "VALUES", "WINDOWS", "Evidence"]
 
@@ -79,9 +80,9 @@ class Evidence:
         Layer("head", _A, LOGITS + GAINS + 4, kernel=1),
     )
     inputs: ClassVar[dict[str, int]] = {"evidence": sum(CHANNELS.values())}
-    multiple: ClassVar[int] = 8
+    stride: ClassVar[int] = 8
     innermost: ClassVar[bool] = True
-    forms: ClassVar[tuple[str, ...]] = ("residual",)
+    outputs: ClassVar[Mapping[str, Output | None]] = {"residual": None}  # see `runtimes.mixture`
     latent: ClassVar[bool] = False
 
     def forward(self, ops: Ops[Any], inputs: Mapping[str, Any]) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def hypotheses(
         if step == 2:
             pick(near, window, dst=others[k])
         else:
-            _spread(pick(near, window), 2 / step, others[k])
+            _spread(np.asarray(pick(near, window), np.float32), 2 / step, others[k])
     coarse = near
     if step > 1:
         coarse = np.empty((height, width), np.float32)

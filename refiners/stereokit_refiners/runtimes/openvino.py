@@ -65,7 +65,7 @@ class _OpenVinoOps:
         y = op.prelu(y, _const([0.1]))
         return y if scale is None else self._rounded(y, bound, scale)
 
-    def conv_split(self, name: str, inputs: Sequence[Any]) -> Any:
+    def conv_transpose_phases(self, name: str, inputs: Sequence[Any]) -> Any:
         return self._convolve(self.table[name], inputs, None)
 
     def sample(self, mean: Any, log_sigma: Any) -> Any:
@@ -82,7 +82,7 @@ class _OpenVinoOps:
         scale = self._scale(name)
         return y if scale is None else self._rounded(y, float(scale.max()), np.ones_like(scale))
 
-    def twice(self, x: Any) -> Any:
+    def upsample2x(self, x: Any) -> Any:
         return self._doubled(x, mode="linear_onnx", coordinate_transformation_mode="half_pixel")
 
     def repeat(self, x: Any) -> Any:
@@ -169,18 +169,18 @@ def build(network: Network, weights: Weights, rows: int, columns: int, ranges: R
         Largest absolute value of each channel of each activation, by name, for int8.
     """
     ops = _OpenVinoOps(network, weights, ranges or {})
-    inputs, given = {}, {}
+    parameters, inputs = {}, {}
     for name, channels in network.inputs.items():
         size = [1, rows, columns, channels] if network.innermost else [1, channels, rows, columns]
         whole = network.innermost and bool(ranges)
-        inputs[name] = given[name] = op.parameter(size, np.int8 if whole else np.float32, name=name)
+        parameters[name] = inputs[name] = op.parameter(size, np.int8 if whole else np.float32, name=name)
         if network.innermost:
-            given[name] = op.transpose(inputs[name], op.constant(np.array([0, 3, 1, 2], np.int64)))
+            inputs[name] = op.transpose(parameters[name], op.constant(np.array([0, 3, 1, 2], np.int64)))
         if whole:
-            given[name] = ops.bytes(given[name])
-    head = network.forward(ops, given)["map"]
+            inputs[name] = ops.bytes(inputs[name])
+    head = network.forward(ops, inputs)["map"]
     head = op.transpose(head, op.constant(np.array([0, 2, 3, 1], np.int64)))  # the layout that it has in memory
-    return ov.Model([op.result(head)], list(inputs.values()), network.name)
+    return ov.Model([op.result(head)], list(parameters.values()), network.name)
 
 
 @lru_cache(maxsize=1)

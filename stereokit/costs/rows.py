@@ -4,7 +4,7 @@ A cost is a *producer of rows*. It prepares an image pair once and returns, for 
 arrays; `cost_row` then writes the costs of row `y`, ``(W, P)`` ``uint8``, disparity innermost, when a sweep asks
 for it. Costs are cheap to compute again, so the cost volume is never stored.
 
-Which code `cost_row` runs is decided by the *type* of the named tuple when a sweep is compiled (see
+The *type* of the named tuple decides, when a sweep is compiled, which code `cost_row` runs (see
 `implements`): two producers times two sweeps are four specialisations of one source, and a third cost is one
 more file.
 
@@ -81,7 +81,7 @@ class CostInput:
         Cost of a level whose right pixel lies outside the image, as a share of the cost's range; None takes
         the nearest border pixel instead.
     threads : int
-        How many threads preparation may use.
+        Threads that preparation may use.
     ranges : ((int, int), (int, int)) or None
         Smallest and largest value of the left and of the right image, where these are windows of larger ones; None
         where they are whole.
@@ -136,7 +136,7 @@ def takes_8_bits(cost: Any) -> bool:
 
 
 class CellMask(NamedTuple):
-    """Which cells of a row of costs have no evidence (flat arrays, for kernels)."""
+    """Cells of a row of costs that have no evidence (flat arrays, for kernels)."""
 
     width: int
     blocks: tuple[int, ...]  # one element per 64 levels: its length is known to the compiler

@@ -1,7 +1,7 @@
 """From a calibrated pair to depth in metres and a point cloud.
 
 ``python depth_and_points.py left.png right.png calib.txt`` takes a rectified pair with its calibration (Middlebury,
-ETH3D, KITTI or JSON); without arguments it draws a synthetic street (``stereokit[evaluation]``).
+ETH3D, KITTI or JSON); without arguments it draws a synthetic street (``stereokit[scenes]``).
 """
 
 import sys

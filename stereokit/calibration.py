@@ -30,9 +30,9 @@ from stereokit.notices import warn
 __all__ = ["Calibration", "read_calibration"]
 
 _CENTRE_PX, _SHARE = 0.5, 0.001
-"""How far what rectified cameras share may differ: principal points in pixels, focal lengths as a share of them."""
+"""Tolerances of the shared values of rectified cameras: of principal points, pixels; of focal lengths, relative."""
 _BASELINES_M = 0.001, 100.0
-"""Baselines outside of these are warned of: they are mostly in another unit."""
+"""Range of baselines without a warning: others are mostly in another unit."""
 _KINDS = "known are Middlebury's calib.txt, KITTI's files, and JSON with fx, fy, cx0, cy, baseline_m"
 _OTHER_KINDS = {
     "an OpenCV calibration (YAML)": r"\A%YAML|!!opencv-matrix",
@@ -46,7 +46,7 @@ _OTHER_KINDS = {
     "a calibration of Cityscapes (JSON)": r'"(intrinsic|extrinsic)"\s*:',
     "a file of bare numbers, such as K.txt": r"\A[-+.\deE\s,;\[\]()]+\Z",
 }
-"""What files of other programs are called, and what tells them."""
+"""Kinds of files of other programs, each with the pattern that identifies it."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class Calibration:
     baseline_m : float
         Distance between the cameras, metres.
     cx1 : float, optional
-        Principal point of the right camera, pixels; `cx0` when not given, and then stored as such.
+        Principal point of the right camera, pixels; `cx0` by default.
     width, height : int, optional
-        Size of the images, pixels. When given, maps of another size are refused.
+        Size of the images, pixels. If present, maps of another size are refused.
 
     Raises
     ------
@@ -123,7 +123,7 @@ class Calibration:
         Returns
         -------
         (H, W) float32
-            Metres along the optical axis, NaN where the disparity is invalid or says "beyond infinity"
+            Metres along the optical axis, NaN where the disparity is invalid or of a point beyond infinity
             (``disparity + doffs <= 0``).
 
         Raises
@@ -198,7 +198,7 @@ class Calibration:
         )
 
     def check_size(self, width: int, height: int) -> None:
-        """Refuse a map of `width` x `height` pixels if the calibration says that it is for another size.
+        """Refuse a map of `width` x `height` pixels if the calibration is for another size.
 
         Raises
         ------
@@ -229,7 +229,7 @@ def _pixels(name: str, value: float) -> int:
 def read_calibration(
     path: str | os.PathLike[str], cameras: tuple[int, int] = (2, 3), size: tuple[int, int] | None = None
 ) -> Calibration:
-    """Read a calibration file; its content tells which of the known forms it has.
+    """Read a calibration file; the format is recognised by the content.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def read_calibration(
     cameras : pair of int
         Left and right camera of a KITTI file: (2, 3) is the colour pair, (0, 1) the grey one.
     size : pair of int or None
-        Width and height of the images that it should be for, pixels.
+        Width and height of the images, pixels.
 
     Warns
     -----
@@ -251,7 +251,7 @@ def read_calibration(
     InputError
         If it is for images of another `size`.
     FileError
-        If the file is missing, has none of the known forms, lacks a field, or contradicts itself: the two cameras of a
+        If the file is missing, is of no known format, lacks a field, or contradicts itself: the two cameras of a
         rectified pair share fx, fy and cy, have no skew, and ``doffs`` is the difference of their cx.
     """
     camera = _read(path, cameras)
@@ -281,11 +281,11 @@ def _read(path: str | os.PathLike[str], cameras: tuple[int, int]) -> Calibration
 
 
 def _other_kind(text: str) -> str | None:
-    """Return what a file of another program is, with its article, None if it is nothing that is known."""
+    """Return the kind of another program's file, with its article, or None if it is of no known kind."""
     start = text.lstrip()
-    for what, pattern in _OTHER_KINDS.items():
+    for kind, pattern in _OTHER_KINDS.items():
         if re.search(pattern, start, re.MULTILINE):
-            return what
+            return kind
     return None
 
 
@@ -372,7 +372,7 @@ def _from_kitti(lines: dict[str, str], cameras: tuple[int, int]) -> Calibration:
 
 
 def _check_pinhole(name: str, focal: float, skew: float, below: float, last: list[float]) -> None:
-    """Refuse a camera matrix that says more than a focal length and a principal point."""
+    """Refuse a camera matrix with more than a focal length and a principal point."""
     if not focal > 0:
         raise OptionError(f"{name} must begin with a positive focal length, got {focal:g}")
     if abs(skew) > _CENTRE_PX:
@@ -382,9 +382,9 @@ def _check_pinhole(name: str, focal: float, skew: float, below: float, last: lis
 
 
 def _check_rectified(
-    left: str, of_left: tuple[float, float, float], right: str, of_right: tuple[float, float, float]
+    left: str, left_values: tuple[float, float, float], right: str, right_values: tuple[float, float, float]
 ) -> None:
-    """Refuse two cameras that differ in what rectified ones share: fx, fy and cy."""
-    for name, a, b in zip(("fx", "fy", "cy"), of_left, of_right, strict=True):
+    """Refuse two cameras that differ in the values that rectified ones share: fx, fy and cy."""
+    for name, a, b in zip(("fx", "fy", "cy"), left_values, right_values, strict=True):
         if abs(a - b) > (_CENTRE_PX if name == "cy" else _SHARE * abs(a)):
             raise OptionError(f"{left} and {right} must share {name}, as rectified cameras do, got {a:g} and {b:g}")

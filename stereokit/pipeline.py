@@ -1,7 +1,7 @@
-"""What every way from a pair to a map offers, and the one through the CPU.
+"""The protocol of pipelines from a pair to a map, and the pipeline of the CPU.
 
-A pipeline is made of `stereokit.settings.MatchSettings` and keeps nothing but buffers between calls; it may be used by
-many threads at the same time. The way through the GPU is `stereokit.cuda.pipeline.CudaPipeline`.
+A pipeline is built from `stereokit.settings.MatchSettings`. Its only state between calls is its buffers; many threads
+may use it at the same time. The pipeline of the GPU is `stereokit.cuda.pipeline.CudaPipeline`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from stereokit.settings import Detail, MatchSettings
 __all__ = ["CpuPipeline", "Pipeline", "refined"]
 
 _PROBES = (256, 512)
-"""Sides of the windows that are matched to see how buffers grow, pixels."""
+"""Sides of the images that are matched to measure the growth of the buffers, pixels."""
 
 
 class Pipeline(Protocol):
@@ -35,7 +35,7 @@ class Pipeline(Protocol):
 
     @property
     def settings(self) -> MatchSettings:
-        """All that a map depends on beside the images."""
+        """Everything a map depends on, except the images."""
 
     def match(self, pair: GrayPair, threads: int) -> Disparity:
         """Match a checked pair.
@@ -50,14 +50,14 @@ class Pipeline(Protocol):
         Returns
         -------
         Disparity, (H, W)
-            Refined, where a refiner was asked for; without the right view's map.
+            Refined, where the settings have a refiner; without the right view's map.
         """
 
     def replaced(self, **changes: Any) -> Pipeline:
         """Return a pipeline of the same kind whose settings differ in some values."""
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
-        """Return how many bytes of buffers the matching of a pair takes, beside images, maps and the refiner.
+        """Return the bytes of the buffers for a pair, without images, maps and the refiner.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class Pipeline(Protocol):
 
 
 def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads: int) -> Disparity:
-    """Return the map that a pipeline hands out: at full size, without what only the refiner wanted.
+    """Return the final map of a pipeline: at full size, without the outputs that only the refiner needed.
 
     Raises
     ------
@@ -78,17 +78,19 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     """
     if settings.refiner is None:
         return coarse
-    further: dict[str, Any] = {}
+    keywords: dict[str, Any] = {}
     if getattr(settings.refiner, "any_scale", False):
-        further["scale"] = settings.scale
+        keywords["scale"] = settings.scale
     if getattr(settings.refiner, "needs_right", False):
-        further["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
+        keywords["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
     with span("refine", "refine"):
-        full = settings.refiner(coarse, pair.guide, threads=threads, **further)
+        full = settings.refiner(coarse, pair.guide, threads=threads, **keywords)
     if not isinstance(full, Disparity) or full.disparity.shape != pair.guide.shape:
-        got = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
+        received = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
         size = pair.guide.shape
-        raise OptionError(f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {got}")
+        raise OptionError(
+            f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {received}"
+        )
     disparity = full.disparity
     if getattr(settings.refiner, "needs_right", False):  # it measures for itself, and may leave the range
         levels = settings.levels
@@ -99,7 +101,7 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
 
 
 class CpuPipeline:
-    """The way through the CPU.
+    """The pipeline of the CPU.
 
     Parameters
     ----------
@@ -118,7 +120,7 @@ class CpuPipeline:
         return refined(self.settings, coarse, pair, threads)
 
     def _coarse(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
-        """Return the map of the size at which is matched."""
+        """Return the map at the size of the matching."""
         settings = self.settings
         cost, aggregation, levels = settings.cost, settings.aggregation, settings.matched_levels
         if settings.scale != 1:
@@ -130,7 +132,14 @@ class CpuPipeline:
         with span("prepare", "prepare cost"):
             rows = cost.prepare(
                 CostInput(
-                    pair.left, pair.right, pair.left_bad, pair.right_bad, levels, settings.outside, threads, pair.ranges
+                    pair.left,
+                    pair.right,
+                    pair.left_bad,
+                    pair.right_bad,
+                    levels,
+                    settings.border_cost,
+                    threads,
+                    pair.ranges,
                 ),
                 workspace,
                 max(2, threads),
@@ -157,7 +166,7 @@ class CpuPipeline:
         return CpuPipeline(self.settings.replaced(**changes))
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
-        """Return how many bytes of buffers a pair takes; see `Pipeline`. Found by matching four small pairs."""
+        """Return the bytes of the buffers for a pair; see `Pipeline`. Measured on four small pairs."""
         dtype = np.dtype(dtype)
         if dtype not in self._growth:
             sizes = [(rows, columns) for rows in _PROBES for columns in _PROBES]
@@ -167,7 +176,7 @@ class CpuPipeline:
         return float(self._growth[dtype] @ (1, height, width, height * width))
 
     def _buffer_nbytes(self, height: int, width: int, dtype: Any) -> int:
-        """Return the bytes of the buffers of one match, which is made for it."""
+        """Return the bytes of the buffers of one match, after matching a made-up pair."""
         image = (np.arange(height * width, dtype=np.uint32) * 2654435761 >> 16).astype(dtype).reshape(height, width)
         workspace = Workspace()
         self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, 1)

@@ -1,7 +1,7 @@
-"""What a matcher returns: the disparity map, what was measured in it, how sure it is, and what to do with it.
+"""The result of a matcher: the disparity map with its valid pixels and confidence, and its depth, points and colours.
 
 The colours are Google's Turbo map (Mikhailov 2019, as in OpenCV): it runs from dark blue (far) to dark red
-(near) without the false edges of a rainbow, and black is left for pixels without a value.
+(near) without the false edges of a rainbow. Pixels without a value are black.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ class Disparity:
     right : (H, W) float32, optional
         The map of the right view, pixels, NaN where invalid.
     candidates : (2, H, W) float32, optional
-        Disparities that the aggregated costs alone are in favour of, pixels: the best, before any check, filter or
-        fill, and the best of those that are not next to it, or the best again where there is none. Refiners that ask
-        for them get them.
+        The two disparities of lowest aggregated cost, pixels, before any check, filter or fill: the best, and the best
+        of those that are not next to it, or the best again where there is none. Only for refiners that need them.
 
     Raises
     ------
@@ -85,6 +84,12 @@ class Disparity:
             f"Disparity({height}x{width}, {span}, {100 * self.density:.1f} % measured{''.join(f', {m}' for m in more)})"
         )
 
+    def _repr_png_(self) -> bytes:
+        """Return the map in colours, as notebooks show it."""
+        good, data = cv2.imencode(".png", self.color()[:, :, ::-1])
+        assert good
+        return data.tobytes()
+
     @property
     def density(self) -> float:
         """The share of pixels that were measured, from 0 to 1."""
@@ -121,7 +126,7 @@ class Disparity:
         ----------
         path : path
         clip : bool
-            Bring what a ``.png`` cannot say, below 0 and above 65535/256 pixels, to its ends.
+            Clip disparities to the range of a ``.png``, 0 to 65535/256 pixels.
 
         Raises
         ------
@@ -134,7 +139,7 @@ class Disparity:
 
 
 def color_range(disparity: NDArray[Any]) -> tuple[float, float]:
-    """Return the disparities of the first and the last colour where nobody says otherwise, pixels.
+    """Return the default disparities of the first and the last colour, pixels.
 
     Parameters
     ----------
@@ -164,7 +169,7 @@ def colorize(disparity: ArrayLike, low: float | None = None, high: float | None 
     disparity : (H, W) float
         Pixels, not finite where invalid.
     low, high : float, optional
-        Disparities of the first and the last colour, pixels; what lies outside takes the end's colour. The defaults
+        Disparities of the first and the last colour, pixels; values outside take the end's colour. The defaults
         are those of `color_range`.
 
     Returns
@@ -191,13 +196,13 @@ def colorize(disparity: ArrayLike, low: float | None = None, high: float | None 
     if not (np.isfinite(low) and np.isfinite(high) and high > low):
         raise OptionError(f"high must be finite and above low, got low={low}, high={high}")
     span = (np.where(known, values, low).astype(np.float32) - np.float32(low)) / np.float32(high - low)
-    colors: NDArray[np.uint8] = _turbo()[np.rint(np.clip(span, 0, 1) * 255).astype(np.uint8)]
+    colors: NDArray[np.uint8] = _turbo_map()[np.rint(np.clip(span, 0, 1) * 255).astype(np.uint8)]
     colors[~known] = 0
     return colors
 
 
 @lru_cache(maxsize=1)
-def _turbo() -> NDArray[np.uint8]:
+def _turbo_map() -> NDArray[np.uint8]:
     steps = np.arange(256, dtype=np.uint8)[:, None]
     return np.ascontiguousarray(cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, 0, ::-1], dtype=np.uint8)
 

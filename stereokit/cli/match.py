@@ -1,4 +1,4 @@
-"""The command ``stereokit match``: one pair, one map, and what is made of it."""
+"""The command ``stereokit match``: one pair, its map, and further files from the map."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from stereokit.cli.options import (
     RefinerOption,
     ScaleOption,
     SettingsOption,
+    WeightsOption,
     check_fits_png,
     check_json,
-    described,
+    matcher_report,
     parse_settings,
 )
 from stereokit.cli.output import Table, report, version_of, waiting
@@ -49,6 +50,7 @@ def match(
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,
     refiner: RefinerOption = None,
+    weights: WeightsOption = None,
     fill: FillOption = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
     device: DeviceOption = "auto",
@@ -93,10 +95,10 @@ def match(
     _check_distinct({"LEFT": left, "RIGHT": right_image, "--calibration": calibration}, outputs)
     if (ply is None) != (calibration is None):
         raise OptionError("--ply and --calibration go together, got only one of them")
-    chosen = parse_settings(settings or [])
-    wanted = {"fill": fill, "right": right and True, "confidence": confidence and True}
-    chosen.update({name: value for name, value in wanted.items() if value is not None})
-    matching: dict[str, Any] = {
+    options = parse_settings(settings or [])
+    flags = {"fill": fill, "weights": weights, "right": right and True, "confidence": confidence and True}
+    options.update({name: value for name, value in flags.items() if value is not None})
+    matcher_options: dict[str, Any] = {
         "max_disparity": max_disparity,
         "min_disparity": min_disparity,
         "scale": scale,
@@ -110,13 +112,15 @@ def match(
                 raise OptionError(f"{name} is not available with --memory and --overlap")
         from stereokit.cli.match_large import match_in_windows
 
-        done, shown = match_in_windows(left, right_image, output, method, memory, overlap, {**matching, **chosen})
-        report({**done, "options": chosen, "version": version_of("stereokit")}, [shown], json_file)
+        content, table = match_in_windows(
+            left, right_image, output, method, memory, overlap, {**matcher_options, **options}
+        )
+        report({**content, "options": options, "version": version_of("stereokit")}, [table], json_file)
         return
 
     from stereokit.matching import Matcher
 
-    matcher = Matcher(method, **matching, **chosen)
+    matcher = Matcher(method, **matcher_options, **options)
     images = io.read_pair(left, right_image)
     height, width = images[0].shape[:2]
     if images[1].shape[:2] != (height, width):
@@ -125,9 +129,9 @@ def match(
     camera = _read_camera(calibration, cameras, width, height)
 
     with waiting("Matching (the first run also compiles) ..."):
-        small = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
+        blanks = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
         with collecting():
-            matcher(*small)  # compiles, so that the time below is that of matching
+            matcher(*blanks)  # compiles, so that the time below is that of matching
         start = time.perf_counter()
         result = matcher(*images)
         seconds = time.perf_counter() - start
@@ -136,9 +140,9 @@ def match(
     if color is not None:
         io.write_image(color, result.color())
     if right is not None:
-        io.write_disparity(right, _present(result.right, "--right", matcher.method), clip=True)
+        io.write_disparity(right, _require(result.right, "--right", matcher.method), clip=True)
     if confidence is not None:
-        _write_confidence(confidence, _present(result.confidence, "--confidence", matcher.method))
+        _write_confidence(confidence, _require(result.confidence, "--confidence", matcher.method))
     if ply is not None and camera is not None:
         _write_cloud(ply, result, camera, images[0])
     content = {
@@ -147,8 +151,8 @@ def match(
         "outputs": {name.removeprefix("--"): str(path) for name, path in outputs.items() if name != "--json"},
         "width": width,
         "height": height,
-        **described(matcher),
-        "options": chosen,
+        **matcher_report(matcher),
+        "options": options,
         "density": result.density,
         "seconds": seconds,
         "version": version_of("stereokit"),
@@ -166,11 +170,11 @@ def match(
 
 
 def _check_distinct(inputs: dict[str, Path | None], outputs: dict[str, Path]) -> None:
-    taken = {os.path.realpath(path): name for name, path in inputs.items() if path is not None}
+    names = {os.path.realpath(path): name for name, path in inputs.items() if path is not None}
     for name, path in outputs.items():
-        other = taken.setdefault(os.path.realpath(path), name)
-        if other != name:
-            raise OptionError(f"{name} and {other} must be different files, got {str(path)!r} for both")
+        first_name = names.setdefault(os.path.realpath(path), name)
+        if first_name != name:
+            raise OptionError(f"{name} and {first_name} must be different files, got {str(path)!r} for both")
 
 
 def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height: int) -> Calibration | None:
@@ -181,7 +185,7 @@ def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height
     return read_calibration(path, cameras, (width, height))
 
 
-def _present(array: NDArray[Any] | None, option: str, method: str) -> NDArray[Any]:
+def _require(array: NDArray[Any] | None, option: str, method: str) -> NDArray[Any]:
     if array is None:
         raise OptionError(f"{option}: method {method!r} with these options gives none")
     return array
@@ -206,7 +210,7 @@ def _write_cloud(path: Path, result: Disparity, camera: Calibration, image: NDAr
     from stereokit.images.intensity import display_8bit
 
     points = result.points(camera)
-    kept = np.isfinite(points).all(axis=2)
-    shown = display_8bit(image)
-    colors = shown if shown.ndim == 3 else np.repeat(shown[:, :, None], 3, axis=2)
-    io.write_ply(path, points[kept], colors[kept])
+    finite = np.isfinite(points).all(axis=2)
+    picture = display_8bit(image)
+    colors = picture if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)
+    io.write_ply(path, points[finite], colors[finite])

@@ -185,7 +185,7 @@ class CudaPipeline:
         left, right : (H, W) or (H, W, 3) uint8, C-contiguous, with ``__cuda_array_interface__``
             Grey or RGB; not modified.
         stream : stream of numba, PyTorch or CuPy, int, or None
-            Stream of the launches; None is the default stream, which waits for all others unless they were made otherwise.
+            Stream of the launches; None is the default stream, which waits for all others but non-blocking ones.
 
         Raises
         ------
@@ -279,7 +279,7 @@ class CudaPipeline:
         if settings.smooth > 0:
             images, dtype = smooth(queue, images, dtype, settings.smooth, shape), np.dtype(np.uint16)
         masks = queue.array("no.bad", 1, np.uint8) if bad is None else bad
-        pair = DevicePair(images, dtype, masks, bad is not None, height, width, levels, settings.outside, ranges)
+        pair = DevicePair(images, dtype, masks, bad is not None, height, width, levels, settings.border_cost, ranges)
         if pixels * pair.padded >= 2**34:
             raise DeviceError(
                 f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * pair.padded}"

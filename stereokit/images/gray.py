@@ -1,8 +1,8 @@
 """From images of any kind to a grey pair.
 
 Whatever comes in (grey or RGB, 8 or 16 bit or floating point, strided, read-only, with NaN) leaves as two grey
-C-contiguous ``uint8`` or ``uint16`` images and the masks of the pixels that carry no evidence. Nothing that comes in
-is modified. What the values of 16-bit and floating-point images become is said in `stereokit.images.intensity`.
+C-contiguous ``uint8`` or ``uint16`` images and the masks of the pixels that carry no evidence. The images that come
+in are not modified. `stereokit.images.intensity` maps the values of 16-bit and floating-point images.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError
 from stereokit.images.check import checked_image, writable
-from stereokit.images.intensity import find_tone, scale_guide
+from stereokit.images.intensity import find_mapping, scale_guide
 
 __all__ = [
     "GrayPair",
@@ -71,20 +71,23 @@ def gray_pair(left: Any, right: Any, nodata: float | None = None) -> GrayPair:
     Warns
     -----
     StereokitWarning
-        If few grey levels are left; see `stereokit.images.intensity.find_tone`.
+        If few grey levels are left; see `stereokit.images.intensity.find_mapping`.
     """
     images = checked_image("left", left), checked_image("right", right)
     check_same(*images, *(getattr(image, "dtype", None) for image in (left, right)))
-    tone = find_tone(lambda: [(0, image) for image in images], images[0].dtype, images[0].shape, nodata)
-    (a, left_bad), (b, right_bad) = (tone.apply(image) for image in images)
+    mapping = find_mapping(lambda: [(0, image) for image in images], images[0].dtype, images[0].shape, nodata)
+    (a, left_bad), (b, right_bad) = (mapping.apply(image) for image in images)
     a, b = writable(a), writable(b)
-    return GrayPair(a, b, left_bad, right_bad, tone.guide(a), span=tone.span)
+    return GrayPair(a, b, left_bad, right_bad, mapping.guide(a), span=mapping.span)
 
 
-def check_same(left: Any, right: Any, *given: Any) -> None:
-    """Raise InputError unless two images, or sources of them, have one type and size; `given` are the user's types."""
+def check_same(left: Any, right: Any, *user_types: Any) -> None:
+    """Raise InputError unless two images, or sources of them, have one type and size.
+
+    The message names the `user_types`, where they are not those of the images.
+    """
     if left.dtype != right.dtype:
-        types = " and ".join(str(a or b.dtype) for a, b in zip(given or (None, None), (left, right), strict=True))
+        types = " and ".join(str(a or b.dtype) for a, b in zip(user_types or (None, None), (left, right), strict=True))
         raise InputError(f"left and right must have the same type, got {types}")
     if left.shape[:2] != right.shape[:2]:
         raise InputError(f"left and right must have the same size, got {left.shape[:2]} and {right.shape[:2]}")

@@ -1,4 +1,4 @@
-"""What happens to a grey pair before it is matched: half size, and a Gaussian."""
+"""The preparation of a grey pair: half size, and a Gaussian blur."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ def smooth(
     sigma : float
         Standard deviation in pixels; 0 returns the pair itself.
     workspace : Workspace or None
-        Where the smoothed images are kept until the next call; None makes new ones.
+        The owner of the buffers of the smoothed images, which the next call overwrites; None makes new ones.
     threads : int
         Threads to use.
     eight_bits : bool
-        Whether the result is of 8 bits, whatever the pair is.
+        Whether the result is of 8 bits, for pairs of 16 bits too.
     """
     if eight_bits and pair.left.dtype != np.uint8:
         left, right = scale_guide(pair.left, *pair.span), scale_guide(pair.right, *pair.span)
         pair = GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide)
     if sigma == 0:
         return pair
-    held = workspace or Workspace()
+    buffers = workspace or Workspace()
     images = pair.left, pair.right
-    wide, blurred = ([held.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
+    deep, blurred = ([buffers.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
 
     def blur(k: int) -> None:
         image = images[k]
         if image.dtype == np.uint8:
-            image = np.multiply(image, np.uint16(256), out=wide[k])
+            image = np.multiply(image, np.uint16(256), out=deep[k])
         cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
 
     run([partial(blur, 0), partial(blur, 1)], threads)

@@ -24,7 +24,7 @@ def write_ply(path: str | os.PathLike[str], points: ArrayLike, colors: ArrayLike
     path : path
         Ends in ``.ply``.
     points : (N, 3) float
-        Metres, finite; kept as float32.
+        Metres, finite; stored as float32.
     colors : (N, 3) uint8, optional
         RGB of each point.
 

@@ -235,7 +235,7 @@ def test_bad_options_are_named(options, message):
 def test_without_the_photographs_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage", None)
     textures.photograph.cache_clear()
-    with pytest.raises(StereokitError, match=r"pip install stereokit\[evaluation\]"):
+    with pytest.raises(StereokitError, match=r"pip install stereokit\[scenes\]"):
         textures.photograph("brick")
 
 

@@ -34,7 +34,8 @@ NONSENSE: tuple[Any, ...] = (
     np.complex64(1), np.datetime64(0, "s"), np.str_("sgm"), object, len, Ellipsis, range(3), slice(1),
 )  # fmt: skip
 NAMES = (
-    "method", "max_disparity", "min_disparity", "scale", "refiner", "threads", "fill", "median", "outside", "smooth",
+    "method", "max_disparity", "min_disparity", "scale", "refiner", "threads", "fill", "median", "border_cost",
+    "smooth",
     "uniqueness", "speckle", "smp", "subpixel", "confidence", "right", "window", "steps", "p1", "p2", "paths", "edge",
     "edge_factor", "sigma_s", "sigma_v", "sigma_r", "passes", "mode", "nodata", "unknown",
 )  # fmt: skip
@@ -149,7 +150,7 @@ def options_of(rng: Rng) -> dict[str, Any]:
     options["max_disparity"] = low + int(rng.integers(65, 129) if many else rng.integers(1, 65))
     choices: dict[str, tuple[Any, ...]] = {
         "threads": (1, 2, 2, 3, 7), "fill": (None, "background", "nearest"), "median": (0, 3, 5),
-        "outside": (None, 0.0, 0.5, 1.0), "smooth": (0, 0.6, 1.4), "uniqueness": (0, 3, 100),
+        "border_cost": (None, 0.0, 0.5, 1.0), "smooth": (0, 0.6, 1.4), "uniqueness": (0, 3, 100),
         "speckle": (0, 0.002, 0.2, 1), "smp": (True, False), "subpixel": (True, False), "confidence": (True, False),
         "right": (False, True), "scale": (1, 0.5),
     }  # fmt: skip

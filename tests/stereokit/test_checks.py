@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stereokit
-from stereokit.checks import doubts, doubts_about_density, low_density, same_pixels
+from stereokit.checks import density_warnings, min_density, pair_warnings, same_pixels
 from stereokit.errors import StereokitWarning
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit.result import Disparity
@@ -76,12 +76,12 @@ def test_large_pairs_are_warned_of(left, right, words, tmp_path):
 
 
 def test_density_decides():
-    assert [low_density(levels) for levels in (2048, 128, 64, 32, 16, 8, 1)] == [0.3, 0.3, 0.35, 0.4, 0.45, 0.45, 0.45]
+    assert [min_density(levels) for levels in (2048, 128, 64, 32, 16, 8, 1)] == [0.3, 0.3, 0.35, 0.4, 0.45, 0.45, 0.45]
     for measured, number in ((0, "0.0 %"), (9, "9.0 %"), (34, "34 %"), (35, None), (100, None)):
         valid = (np.arange(100) < measured).reshape(10, 10)
         found = Disparity(np.zeros((10, 10), np.float32), valid)
-        lines = doubts(LEFT, RIGHT, found, -4, 60)
-        assert lines == doubts_about_density(measured / 100, -4, 60)
+        lines = pair_warnings(LEFT, RIGHT, found, -4, 60)
+        assert lines == density_warnings(measured / 100, -4, 60)
         assert (not lines) if number is None else (f"only {number}" in lines[0] and "-4 .. 59" in lines[0])
 
 

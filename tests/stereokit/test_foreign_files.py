@@ -259,7 +259,7 @@ def test_a_rare_tiff_says_what_to_install(tmp_path, monkeypatch):
     names = write_all(tmp_path)
     assert "zstd.tif" in names
     monkeypatch.setitem(sys.modules, "tifffile", None)
-    with pytest.raises(FileError, match=r"stereokit\[large\]"):
+    with pytest.raises(FileError, match=r"stereokit\[tiff\]"):
         io.read_image(tmp_path / "zstd.tif")
 
 

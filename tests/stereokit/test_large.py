@@ -345,10 +345,10 @@ def test_broken_tiff_is_refused(content, words, tmp_path):
 def test_tiff_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tifffile", None)
     image = np.zeros((20, 30), np.uint8)
-    with pytest.raises(StereokitError, match=r"stereokit\[large\]"):
+    with pytest.raises(StereokitError, match=r"stereokit\[tiff\]"):
         stereokit.match_large(image, image, tmp_path / "out.tif", "S2")
     (tmp_path / "a.tif").write_bytes(b"II*\0")
-    with pytest.raises(StereokitError, match=r"stereokit\[large\]"):
+    with pytest.raises(StereokitError, match=r"stereokit\[tiff\]"):
         stereokit.match_large(tmp_path / "a.tif", image, tmp_path / "out.npy", "S2")
 
 

@@ -16,7 +16,7 @@ from stereokit import settings as settings_module
 from stereokit.postprocess import fill, median, remove_speckles, single_matching_phase
 
 METHODS = list(stereokit.METHODS.values())
-PLAIN = {"smooth": 0, "uniqueness": 0, "speckle": 0, "outside": 1.0}
+PLAIN = {"smooth": 0, "uniqueness": 0, "speckle": 0, "border_cost": 1.0}
 """No smoothing before and no clean-up after matching but what a test asks for."""
 RAW = {**PLAIN, "smp": False, "fill": None, "median": 0, "confidence": True}
 """No post-processing at all: what selection gives."""
@@ -36,10 +36,10 @@ def shifted(shift, shape=(24, 60), seed=0):
     return left, np.roll(left, -shift, axis=1)
 
 
-def staged(left, right, method, minimum, maximum, outside=1.0, subpixel=True, cost=None, aggregation=None):
+def staged(left, right, method, minimum, maximum, border_cost=1.0, subpixel=True, cost=None, aggregation=None):
     """Return disparity, cost and confidence from the three public stages."""
     cost_name, aggregation_name = method.split("+")
-    levels = {"min_disparity": minimum, "max_disparity": maximum, "outside": outside}
+    levels = {"min_disparity": minimum, "max_disparity": maximum, "border_cost": border_cost}
     volume = cost_volume(left, right, cost_name, **levels, **{**COST[cost_name], **(cost or {})})
     options = {**AGGREGATION[method], **(aggregation or {})}
     maker = {"census": stereokit.Census, "zncc": stereokit.Zncc}[cost_name](**{**COST[cost_name], **(cost or {})})
@@ -52,12 +52,12 @@ def in_full(method, **options):
     return {**COST[method.split("+")[0]], **AGGREGATION[method], **options}
 
 
-def assert_fused_is_staged(left, right, method, minimum, maximum, outside=1.0, cost=None, **aggregation):
-    levels = {"min_disparity": minimum, "max_disparity": maximum, "outside": outside}
+def assert_fused_is_staged(left, right, method, minimum, maximum, border_cost=1.0, cost=None, **aggregation):
+    levels = {"min_disparity": minimum, "max_disparity": maximum, "border_cost": border_cost}
     options = in_full(method, **{**RAW, **levels, **(cost or {}), **aggregation})
     fused = Matcher(method, **options)(left, right)
     disparity, _, confidence = staged(
-        left, right, method, minimum, maximum, outside, cost=cost, aggregation=aggregation
+        left, right, method, minimum, maximum, border_cost, cost=cost, aggregation=aggregation
     )
     np.testing.assert_array_equal(fused.disparity, disparity)
     np.testing.assert_array_equal(fused.confidence, confidence)
@@ -69,8 +69,8 @@ def assert_fused_is_staged(left, right, method, minimum, maximum, outside=1.0, c
 @pytest.mark.parametrize(("minimum", "count"), [(0, 16), (0, 1), (-7, 12), (3, 64), (-30, 65), (40, 5)])
 def test_fused_is_staged(random_pair, method, shape, minimum, count):
     left, right = random_pair(*shape, seed=1)
-    for outside in (1.0, 0.5, None):
-        assert_fused_is_staged(left, right, method, minimum, minimum + count, outside)
+    for border_cost in (1.0, 0.5, None):
+        assert_fused_is_staged(left, right, method, minimum, minimum + count, border_cost)
 
 
 @pytest.mark.parametrize("method", ["census+sgm", "zncc+sgm"])
@@ -417,6 +417,19 @@ def test_identity_is_what_a_map_depends_on():
     others = ({"p1": 0.5}, {"median": 3}, {"fill": None}, {"min_disparity": -1}, {"scale": 0.5}, {"window": 7})
     found = [Matcher("S4", **{"max_disparity": 32, **options}).identity() for options in others]
     assert all(other != identity for other in found)
+
+
+def test_the_old_name_of_the_border_cost_still_works():
+    assert Matcher("S2", outside=None).identity() == Matcher("S2", border_cost=None).identity()
+    assert Matcher("S2").replaced(outside=0.25).settings.border_cost == 0.25
+    image = np.arange(64, dtype=np.uint8).reshape(4, 16)
+    volumes = [
+        stereokit.cost_volume(image, image, max_disparity=4, **{name: 0.25}) for name in ("outside", "border_cost")
+    ]
+    np.testing.assert_array_equal(*volumes)
+    assert not np.array_equal(volumes[0], stereokit.cost_volume(image, image, max_disparity=4))
+    with pytest.raises(OptionError, match="outside is the old name of border_cost, got both"):
+        Matcher("S2", outside=1, border_cost=1)
 
 
 def test_a_matcher_with_changes_leaves_the_first_as_it_was(random_pair):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
@@ -159,3 +160,12 @@ def test_a_png_refuses_what_it_cannot_say(tmp_path, value):
         write(tmp_path / "a.pfm")
         np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.pfm"), values)
         (tmp_path / "a.pfm").unlink()
+
+
+def test_a_notebook_shows_the_map_in_colours():
+    """The picture is `color`, whatever has no value black."""
+    disparity = np.array([[1, 2, np.nan], [4, 8, 16]], np.float32)
+    result = Disparity(disparity, np.isfinite(disparity))
+    picture = cv2.imdecode(np.frombuffer(result._repr_png_(), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+    assert np.array_equal(picture, result.color())
+    assert not picture[0, 2].any()

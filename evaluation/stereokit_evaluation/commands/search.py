@@ -35,7 +35,7 @@ COLUMNS = ["method", "options", "tuning", "validation", "all", *SCENES]
 
 _COMMON: dict[str, list[Any]] = {
     "smooth": [0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0],
-    "outside": [0.3, 0.5, 0.7, 1.0, None],
+    "border_cost": [0.3, 0.5, 0.7, 1.0, None],
     "smp": [False],
     "speckle": [0, 0.0001, 0.0002, 0.0003, 0.0005, 0.001],
     "uniqueness": [2, 5],

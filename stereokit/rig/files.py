@@ -18,7 +18,7 @@ from stereokit.io.calibrations.units import in_metres
 from stereokit.io.quiet import quiet_decoders
 from stereokit.notices import warn
 from stereokit.rig.model import Camera, StereoRig
-from stereokit.rig.rectification import Given
+from stereokit.rig.rectification import RectifiedCameras
 
 __all__ = ["read_rig", "save_rig"]
 
@@ -109,11 +109,11 @@ def _rig(content: Content, exchange: bool) -> StereoRig:
     if exchange:
         turn, step = content.pose
         return StereoRig(right, left, turn.T, -turn.T @ step)
-    given = None
+    rectified_cameras = None
     if content.projections is not None and content.turns is not None:
         check_projections(content)
-        given = Given(content.turns, content.projections, _whole(content))
-    return StereoRig(left, right, *content.pose, given)
+        rectified_cameras = RectifiedCameras(content.turns, content.projections, _whole(content))
+    return StereoRig(left, right, *content.pose, rectified_cameras)
 
 
 def _camera(one: Lens) -> Camera:
@@ -129,7 +129,7 @@ def _of_rectified(content: Content) -> StereoRig:
         size = content.lenses[0].size
     left, right = (Camera(p[:, :3], np.zeros(0), "pinhole", *(size or (None, None))) for p in content.projections)
     same = np.eye(3)
-    return StereoRig(left, right, same, (-baseline, 0, 0), Given((same, same), content.projections, size))
+    return StereoRig(left, right, same, (-baseline, 0, 0), RectifiedCameras((same, same), content.projections, size))
 
 
 def _whole(content: Content) -> Size | None:
@@ -145,7 +145,7 @@ def _missing(content: Content) -> str:
         what = "the matrices of both cameras (K1 and K2, M1 and M2, cameraMatrix1 and cameraMatrix2, left and right)"
     else:
         what = "how the cameras stand to each other (R and T, or R1, R2, P1 and P2)"
-    hint = "; it may be in a second file, such as extrinsics.yml or right.yaml, which can be given too"
+    hint = "; it may be in a second file, such as extrinsics.yml or right.yaml, to be given as well"
     return f"it is {content.kind} that does not tell {what}{hint}"
 
 
@@ -194,14 +194,14 @@ def _entries(rig: StereoRig) -> dict[str, Any]:
         entries[f"D{number}"] = np.array(camera.distortion if len(camera.distortion) else np.zeros(5)).reshape(1, -1)
     entries |= {"R": np.array(rig.rotation), "T": np.array(rig.translation_m).reshape(3, 1)}
     try:
-        made = rig.rectification()
+        rectified = rig.rectification()
     except StereokitError:  # no size, or too wide a lens: others can rectify it their way
         return entries
-    if made.size != rig.size:  # the file format has one size
+    if rectified.size != rig.size:  # the file format has one size
         return entries
     for number in (0, 1):
-        entries[f"R{number + 1}"] = made.turns[number]
+        entries[f"R{number + 1}"] = rectified.turns[number]
     for number in (0, 1):
-        entries[f"P{number + 1}"] = made.projections[number]
-    entries["Q"] = made.calibration.Q
+        entries[f"P{number + 1}"] = rectified.projections[number]
+    entries["Q"] = rectified.calibration.Q
     return entries

@@ -24,12 +24,12 @@ from stereokit.images.check import check_integer
 from stereokit.io.calibrations import Lens
 from stereokit.io.calibrations.content import Size, lens
 from stereokit.notices import warn
-from stereokit.rig.rectification import Given, Rectification, rectification
+from stereokit.rig.rectification import Rectification, RectifiedCameras, rectification
 
 __all__ = ["Camera", "StereoRig"]
 
 Array = NDArray[np.float64]
-_KEPT = 4
+_CACHE_SIZE = 4
 """Rectifications that a rig keeps, of different options."""
 _ORTHOGONAL = 1e-3
 _WIDE_DEGREES = 45.0
@@ -97,7 +97,7 @@ class StereoRig:
     rotation : (3, 3) float
     translation_m : (3,) float
         Metres. Both take a point from the left camera's frame to the right one's, as OpenCV's R and T.
-    given : Given or None
+    rectified_cameras : RectifiedCameras or None
         Rectified cameras that came with the file; they are what `rectify` uses where no other options are asked for.
 
     Raises
@@ -107,15 +107,20 @@ class StereoRig:
     """
 
     def __init__(
-        self, left: Camera, right: Camera, rotation: ArrayLike, translation_m: ArrayLike, given: Given | None = None
+        self,
+        left: Camera,
+        right: Camera,
+        rotation: ArrayLike,
+        translation_m: ArrayLike,
+        rectified_cameras: RectifiedCameras | None = None,
     ) -> None:
         self.left, self.right = left, right
         self.rotation, self.translation_m = _checked(rotation, translation_m)
-        self.given = given
+        self.rectified_cameras = rectified_cameras
         if left.size != right.size:
             texts = " and ".join("no size" if c.size is None else "{}x{}".format(*c.size) for c in (left, right))
             raise OptionError(f"left and right must have images of one size, got {texts}")
-        self._kept: OrderedDict[Any, Rectification] = OrderedDict()
+        self._cache: OrderedDict[Any, Rectification] = OrderedDict()
         self._lock = threading.Lock()
 
     def __repr__(self) -> str:
@@ -123,11 +128,11 @@ class StereoRig:
         return f"StereoRig({self.left.model}, {size}, baseline {self.baseline_m:.4g} m)"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_kept", "_lock")}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_cache", "_lock")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._kept, self._lock = OrderedDict(), threading.Lock()
+        self._cache, self._lock = OrderedDict(), threading.Lock()
 
     @property
     def size(self) -> Size | None:
@@ -150,11 +155,11 @@ class StereoRig:
         if self.size == (width, height):
             return self
         if self.size is not None:
-            wanted = "{}x{}".format(*self.size)
+            size = "{}x{}".format(*self.size)
             hint = "; use StereoRig.scaled for resized images"
-            if self.given is not None and self.given.size == (width, height):
+            if self.rectified_cameras is not None and self.rectified_cameras.size == (width, height):
                 hint = ", and those are rectified ones: nothing is left to rectify"
-            raise InputError(f"the rig is for raw images of {wanted} pixels, got {width}x{height}{hint}")
+            raise InputError(f"the rig is for raw images of {size} pixels, got {width}x{height}{hint}")
         for name, camera in (("left", self.left), ("right", self.right)):
             cx, cy = camera.matrix[0, 2], camera.matrix[1, 2]
             if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
@@ -163,7 +168,7 @@ class StereoRig:
                     f"{width}x{height} pixels: the rig is for images of another size"
                 )
         left, right = (Camera(c.matrix, c.distortion, c.model, width, height) for c in (self.left, self.right))
-        return StereoRig(left, right, self.rotation, self.translation_m, self.given)
+        return StereoRig(left, right, self.rotation, self.translation_m, self.rectified_cameras)
 
     def scaled(self, factor: float) -> StereoRig:
         """Return the rig of images resized by `factor`, such as 0.5.
@@ -220,18 +225,18 @@ class StereoRig:
             raise OptionError("the rig does not know the size of its images: StereoRig.sized(width, height) tells it")
         key = repr((alpha, size, bool(crop), focal))
         with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-                return self._kept[key]
-            own = self.given if (alpha, size, focal) == (None, None, None) else None
-            made = rectification(
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+            cameras = self.rectified_cameras if (alpha, size, focal) == (None, None, None) else None
+            result = rectification(
                 (self._lens(self.left), self._lens(self.right)), (self.rotation, self.translation_m), self.size,
-                own, 0.0 if alpha is None else alpha, size, crop, focal,
+                cameras, 0.0 if alpha is None else alpha, size, crop, focal,
             )  # fmt: skip
-            self._kept[key] = made
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-            return made
+            self._cache[key] = result
+            if len(self._cache) > _CACHE_SIZE:
+                self._cache.popitem(last=False)
+            return result
 
     @staticmethod
     def _lens(camera: Camera) -> Lens:

@@ -19,7 +19,7 @@ from stereokit.errors import InputError, OptionError, shown
 from stereokit.images.check import check_integer, check_number
 from stereokit.io.calibrations.content import Array, Lens, Size, projection
 
-__all__ = ["Given", "Rectification", "rectification"]
+__all__ = ["Rectification", "RectifiedCameras", "rectification"]
 
 _TYPES = (np.uint8, np.uint16, np.float32, np.float64)
 _LEAST_SHARE = 0.02
@@ -27,7 +27,7 @@ _LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True)
-class Given:
+class RectifiedCameras:
     """Rectified cameras that a file tells.
 
     Attributes
@@ -108,7 +108,7 @@ def rectification(
     lenses: tuple[Lens, Lens],
     pose: tuple[Array, Array],
     raw_size: Size,
-    given: Given | None,
+    rectified_cameras: RectifiedCameras | None,
     alpha: float,
     size: Size | None,
     crop: bool,
@@ -122,7 +122,7 @@ def rectification(
     pose : (rotation, translation)
         From left to right, metres.
     raw_size : (width, height)
-    given : Given or None
+    rectified_cameras : RectifiedCameras or None
         Rectified cameras, instead of those that `alpha`, `size` and `focal` give.
     alpha, size, crop, focal
         As of `StereoRig.rectification`.
@@ -139,16 +139,20 @@ def rectification(
         size = check_integer("width", size[0], 8, 2**15), check_integer("height", size[1], 8, 2**15)
     if focal is not None:
         focal = check_number("focal", focal, 1e-3, 1e7)
-    if given is None:
+    if rectified_cameras is None:
         turns, projections = _placed(lenses, pose, raw_size, alpha, size or raw_size, focal)
         target = size or raw_size
     else:
-        turns, projections, target = given.turns, given.projections, given.size or raw_size
+        turns, projections, target = (
+            rectified_cameras.turns,
+            rectified_cameras.projections,
+            rectified_cameras.size or raw_size,
+        )
     fields, masks = [], []
     for one, turn, camera in zip(lenses, turns, projections, strict=True):
         x, y = _maps_of(one, turn, camera, target)
         fields.append((x, y))
-        masks.append(_seen(x, y, raw_size, camera))
+        masks.append(_visible(x, y, raw_size, camera))
     if min(mask.mean() for mask in masks) < _LEAST_SHARE:
         raise OptionError(
             "no rectified pair comes of this rig: hardly a pixel of it lies within the raw images; "
@@ -171,11 +175,11 @@ def rectification(
         width=x1 - x0,
         height=y1 - y0,
     )
-    seen = [np.ascontiguousarray(mask[y0:y1, x0:x1]) for mask in masks]
-    for mask in seen:
+    crops = [np.ascontiguousarray(mask[y0:y1, x0:x1]) for mask in masks]
+    for mask in crops:
         mask.flags.writeable = False
     return Rectification(
-        calibration, seen[0], seen[1], turns, (left - shift, right - shift), raw_size, (maps[0], maps[1])
+        calibration, crops[0], crops[1], turns, (left - shift, right - shift), raw_size, (maps[0], maps[1])
     )
 
 
@@ -212,10 +216,10 @@ def _check_placed(p1: Array, p2: Array, raw: Size, step: Array, focal: float | N
     finite = np.isfinite(p1).all() and np.isfinite(p2).all()
     if not finite or not 0.01 * max(raw) < p1[0, 0] < 100 * max(raw):
         if focal is None:
-            found = f"{p1[0, 0]:g}" if finite else "none"
+            length = f"{p1[0, 0]:g}" if finite else "none"
             raise OptionError(
-                f"the lenses are too wide, or their distortion is wrong: the rectified focal length is {found} pixels; "
-                "choose focal (--focal), or alpha nearer to 0"
+                f"the lenses are too wide, or their distortion is wrong: the rectified focal length is {length} "
+                "pixels; choose focal (--focal), or alpha nearer to 0"
             )
     if not p2[0, 3] < 0 or abs(-p2[0, 3] / p2[0, 0] - np.linalg.norm(step)) > 1e-3 * float(np.linalg.norm(step)):
         raise OptionError("the cameras cannot be rectified side by side: R and T do not go together")
@@ -235,7 +239,7 @@ def _maps_of(one: Lens, turn: Array, rectified: Array, size: Size) -> tuple[NDAr
     return x, y
 
 
-def _seen(x: NDArray[Any], y: NDArray[Any], raw: Size, rectified: Array) -> NDArray[np.bool_]:
+def _visible(x: NDArray[Any], y: NDArray[Any], raw: Size, rectified: Array) -> NDArray[np.bool_]:
     """Return which rectified pixels lie within the raw image, where the lens model does not fold.
 
     Beyond the angles that a distortion was fitted to, its polynomial turns back into the image: what is there is a
@@ -250,12 +254,12 @@ def _seen(x: NDArray[Any], y: NDArray[Any], raw: Size, rectified: Array) -> NDAr
     upright: NDArray[np.bool_] = inside & (xx * yy - xy * yx > 0)
     count, labels = cv2.connectedComponents(upright.astype(np.uint8), connectivity=4)
     if count <= 2:
-        return upright
+        return np.asarray(upright, np.bool_)
     column, row = np.clip(np.rint(rectified[:2, 2]), 0, (x.shape[1] - 1, x.shape[0] - 1)).astype(int)
     middle = labels[row, column]
     if middle == 0:
         middle = 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
-    return np.asarray(labels == middle)
+    return np.asarray(labels == middle, np.bool_)
 
 
 def _cropped(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:

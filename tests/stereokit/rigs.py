@@ -68,8 +68,18 @@ def project(rig: Rig, side: int, points: np.ndarray) -> np.ndarray:
     return cv2.projectPoints(points.reshape(-1, 1, 3), vector, step, rig.k[side], d)[0].reshape(-1, 2)
 
 
+_rays: dict[tuple, np.ndarray] = {}
+
+
 def rays(rig: Rig, side: int, size=SIZE) -> np.ndarray:
     """Return the direction (x, y, 1) of every raw pixel in its camera's frame, (H, W, 3), exact to 1e-9."""
+    key = rig.fisheye, rig.k[side].tobytes(), rig.d[side].tobytes(), size
+    if key not in _rays:
+        _rays[key] = _all_rays(rig, side, size)
+    return _rays[key]
+
+
+def _all_rays(rig: Rig, side: int, size: tuple[int, int]) -> np.ndarray:
     x, y = np.meshgrid(np.arange(size[0], dtype=float), np.arange(size[1], dtype=float))
     pixels = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
     k, d = rig.k[side], rig.d[side]
@@ -128,3 +138,61 @@ def true_depth(r1: np.ndarray, camera: tuple[float, float, float, float], size: 
     x, y = np.meshgrid((np.arange(size[0]) - cx) / fx, (np.arange(size[1]) - cy) / fy)
     directions = np.stack([x, y, np.ones_like(x)], axis=-1) @ r1
     return (meet(np.zeros(3), directions) @ r1.T)[..., 2]
+
+
+def board_pose(number: int, count: int, center: np.ndarray, distance=0.45) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotation and translation that put a board before the left camera: tilted, turned, over the whole view."""
+    rng = np.random.default_rng([9, number])
+    turn = cv2.Rodrigues(np.array([*rng.uniform(-0.55, 0.55, 2), rng.uniform(-0.3, 0.3)]))[0]
+    side = 2.0 * np.pi * number / count
+    reach = 0.0 if number % 4 == 0 else 0.4
+    place = distance * rng.uniform(0.9, 1.4) * np.array([0.06 + reach * np.cos(side), 0.75 * reach * np.sin(side), 1.0])
+    return turn, place - turn @ center
+
+
+def board_image(rig: Rig, side: int, pose, draw, size=SIZE) -> np.ndarray:
+    """Return the raw image of a board, uint8; `draw` gives levels from 0 to 1 for places on it and a pixel's width there."""
+    turn, step = (np.eye(3), np.zeros(3)) if side == 0 else (rig.r, rig.t)
+    turn, step = turn @ pose[0], turn @ pose[1] + step
+    directions = rays(rig, side, size) @ turn  # in the board's frame
+    origin = -turn.T @ step
+    along = -origin[2] / directions[..., 2]
+    place = origin[:2] + along[..., None] * directions[..., :2]
+    place[along <= 0] = 1e6
+    across = np.linalg.norm(np.diff(place, axis=1, append=place[:, -1:]), axis=-1)
+    across[:, -1] = across[:, -2]
+    down = np.linalg.norm(np.diff(place, axis=0, append=place[-1:]), axis=-1)
+    down[-1] = down[-2]
+    return np.rint(255 * draw(place, np.maximum(across, down))).astype(np.uint8)
+
+
+def chessboard(columns: int, rows: int, square: float):
+    """Return what `board_image` draws: a chessboard of so many inner corners with a white border, grey around."""
+
+    def draw(place, width):
+        u, v = place[..., 0] / square, place[..., 1] / square  # the first inner corner is at (0, 0)
+        waves = [np.clip(np.sin(np.pi * w) / (np.pi * np.maximum(width / square, 1e-6)), -1, 1) for w in (u, v)]
+        level = 0.5 + 0.42 * waves[0] * waves[1]
+        white = (u < -1) | (u > columns) | (v < -1) | (v > rows)
+        outside = (u < -2) | (u > columns + 1) | (v < -2) | (v > rows + 1)
+        return np.where(outside, 0.45, np.where(white, 0.92, level))
+
+    return draw, np.array([(columns - 1) / 2 * square, (rows - 1) / 2 * square, 0])
+
+
+def charuco(columns: int, rows: int, square: float, marker: float, dictionary=cv2.aruco.DICT_4X4_50, legacy=False):
+    """Return what `board_image` draws: a ChArUco board of so many squares."""
+    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, cv2.aruco.getPredefinedDictionary(dictionary))
+    board.setLegacyPattern(legacy)
+    fine = 40  # pixels a square
+    picture = board.generateImage((columns * fine, rows * fine), marginSize=0).astype(np.float32) / 255
+    picture = cv2.GaussianBlur(
+        cv2.copyMakeBorder(picture, fine, fine, fine, fine, cv2.BORDER_CONSTANT, value=1), (0, 0), 1.2
+    )
+
+    def draw(place, width):
+        x, y = (place / square * fine + fine - 0.5).astype(np.float32).transpose(2, 0, 1)
+        level = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.45)
+        return 0.08 + 0.84 * level
+
+    return draw, np.array([columns / 2 * square, rows / 2 * square, 0])

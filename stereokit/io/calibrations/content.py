@@ -132,7 +132,7 @@ def numbers(name: str, value: Any) -> Array:
     OptionError
         If something else is in it, a number is not finite, or there are more than any calibration has.
     """
-    found: list[float] = []
+    values: list[float] = []
     waiting: list[Any] = [value]
     steps = 0
     while waiting:
@@ -146,15 +146,15 @@ def numbers(name: str, value: Any) -> Array:
             raise OptionError(f"{name} must hold numbers, got {item}")
         else:
             try:
-                found.append(float(_NOT_FINITE.get(item, item) if isinstance(item, str) else item))
+                values.append(float(_NOT_FINITE.get(item, item) if isinstance(item, str) else item))
             except (TypeError, ValueError, OverflowError) as error:
                 raise OptionError(f"{name} must hold numbers, got {shown(item)}") from error
         if steps > 4096:
             raise OptionError(f"{name} holds more numbers than a calibration has")
-    values = np.array(found, np.float64)
-    if not np.isfinite(values).all():
+    array = np.array(values, np.float64)
+    if not np.isfinite(array).all():
         raise OptionError(f"{name} must hold finite numbers, got {shown(value)}")
-    return values
+    return array
 
 
 def vector(name: str, value: Any, *counts: int) -> Array:

@@ -56,9 +56,9 @@ class _Fields:
         """Return the first name that holds as many numbers as one of `counts`, and them."""
         for name in names:
             if name in self.values:
-                found = self._numbers(name)
-                if found is not None and (not counts or len(found) in counts):
-                    return name, found
+                match = self._numbers(name)
+                if match is not None and (not counts or len(match) in counts):
+                    return name, match
         return None
 
     def pair(self, bases: Iterable[str], *counts: int) -> tuple[tuple[str, Array], tuple[str, Array]] | None:
@@ -181,8 +181,8 @@ def from_keys(kind: str, values: dict[str, Any]) -> Content:
 
 
 def _alone(fields: _Fields, names: Iterable[str], *counts: int) -> Array | None:
-    found = fields.any((prefix + name for prefix in _ALONE for name in names), *counts)
-    return None if found is None else found[1]
+    match = fields.any((prefix + name for prefix in _ALONE for name in names), *counts)
+    return None if match is None else match[1]
 
 
 def _square(pair: tuple[tuple[str, Array], tuple[str, Array]], rows: int, columns: int) -> tuple[Array, Array]:
@@ -229,12 +229,12 @@ def _size(fields: _Fields, camera: int) -> Size | None:
         width, height = (fields.any([side + name for name in names[:some]], 1) for names in (_WIDTHS, _HEIGHTS))
         if width is not None and height is not None:
             return _pixels(width[1][0], height[1][0])
-        found = fields.any((side + name for name in _SIZES), 2)
-        if found is not None:
-            return _pixels(*found[1])
-        found = fields.any((side + name for name in _SHAPES), 2, 3)
-        if found is not None:
-            return _pixels(found[1][1], found[1][0])
+        match = fields.any((side + name for name in _SIZES), 2)
+        if match is not None:
+            return _pixels(*match[1])
+        match = fields.any((side + name for name in _SHAPES), 2, 3)
+        if match is not None:
+            return _pixels(match[1][1], match[1][0])
     return None
 
 

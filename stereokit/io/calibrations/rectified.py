@@ -148,9 +148,9 @@ def from_kitti(text: str, cameras: tuple[int, int]) -> Content:
     if raw and sizes[0] in lines:
         width, height = _numbers(lines, sizes[0], 2, kind)
         size = _size({"width": width, "height": height})
-    told = [f"{letter}_{camera:02d}" for letter in "KDRT" for camera in cameras]
-    told += [f"R_rect_{camera:02d}" for camera in cameras]
-    if not raw or not all(name in lines for name in told):
+    fields = [f"{letter}_{camera:02d}" for letter in "KDRT" for camera in cameras]
+    fields += [f"R_rect_{camera:02d}" for camera in cameras]
+    if not raw or not all(name in lines for name in fields):
         return Content(kind, None, None, (left, right), None, size, "m", (names[0], names[1]))
     lenses: list[Lens] = []
     for camera in cameras:

@@ -120,7 +120,7 @@ def leaves(tree: Any) -> dict[str, Any]:
     OptionError
         If there are more than a calibration has.
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     waiting: list[tuple[str, Any, int]] = [("", tree, 0)]
     steps = 0
     while waiting:
@@ -129,12 +129,12 @@ def leaves(tree: Any) -> dict[str, Any]:
         if steps > _MOST_LEAVES or depth > 50:
             raise OptionError("it holds more than a calibration does")
         if is_matrix(value):
-            found[path] = value["data"]
+            values[path] = value["data"]
         elif isinstance(value, dict):
             waiting += [(path + plain_name(key), part, depth + 1) for key, part in value.items()]
         elif value is not None:
-            found[path] = value
-    return found
+            values[path] = value
+    return values
 
 
 def plain_name(name: Any) -> str:

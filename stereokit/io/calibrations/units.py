@@ -39,11 +39,11 @@ def in_metres(content: Content, unit: str | None, name: str) -> Content:
     if unit is not None and unit not in UNITS:
         raise OptionError(f"unit must be one of {', '.join(UNITS)}, got {shown(unit)}")
     baseline = content.baseline or 0.0
-    used = unit or content.unit
+    source = unit or content.unit
     way_out = "say so with unit= (stereokit rig --unit)"
-    if used is None:
-        used = "mm" if baseline >= _MILLIMETRES_FROM else "m"
-        if used == "mm":
+    if source is None:
+        source = "mm" if baseline >= _MILLIMETRES_FROM else "m"
+        if source == "mm":
             warn(
                 f"{name!r} has a baseline of {baseline:g}, which is taken for millimetres "
                 f"({baseline / 1000:g} m); if it is in another unit, {way_out}"
@@ -53,7 +53,7 @@ def in_metres(content: Content, unit: str | None, name: str) -> Content:
                 f"{name!r} has a baseline of {baseline:g}, taken for metres; "
                 f"if the board's squares were in another unit, or in squares, {way_out}"
             )
-    found = baseline * UNITS[used]
-    if found and not _SURE_M[0] <= found <= _SURE_M[1]:
-        warn(f"{name!r} has a baseline of {found:g} m: is it in the unit that it should be in?")
-    return content.scaled(UNITS[used])
+    length_m = baseline * UNITS[source]
+    if length_m and not _SURE_M[0] <= length_m <= _SURE_M[1]:
+        warn(f"{name!r} has a baseline of {length_m:g} m: is it in the unit that it should be in?")
+    return content.scaled(UNITS[source])

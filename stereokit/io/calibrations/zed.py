@@ -37,12 +37,12 @@ def from_zed(text: str, size: Size | None) -> Content:
         raise OptionError(f"not a ZED settings file: {str(error).splitlines()[0]}") from error
     sections = {name.upper(): name for name in file.sections()}
     there = {name: pixels for name, pixels in _SIZES.items() if f"LEFT_CAM_{name}" in sections}
-    wanted = [name for name, pixels in there.items() if size in (None, pixels)]
-    if len(wanted) != 1:
+    matches = [name for name, pixels in there.items() if size in (None, pixels)]
+    if len(matches) != 1:
         known = ", ".join(f"{name} {w}x{h}" for name, (w, h) in there.items()) or "none that is known"
         which = "several resolutions, so the size of the images must be told" if size is None else "other resolutions"
         raise OptionError(f"it has {which}: {known}")
-    name = wanted[0]
+    name = matches[0]
     both: list[Lens] = []
     for side in ("LEFT", "RIGHT"):
         title = f"{side}_CAM_{name}"
@@ -57,13 +57,13 @@ def from_zed(text: str, size: Size | None) -> Content:
         raise OptionError("it has no section [STEREO], which holds the baseline")
     stereo = file[sections["STEREO"]]
 
-    def told(key: str, default: float | None = 0.0) -> float:
+    def value(key: str, default: float | None = 0.0) -> float:
         own = f"{key}_{name}"
         return _number("STEREO", stereo, own if own.lower() in stereo else key, default)
 
-    turn: Array = np.array([told("RX"), told("CV"), told("RZ")])
+    turn: Array = np.array([value("RX"), value("CV"), value("RZ")])
     rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
-    translation = np.array([-told("Baseline", None), told("TY"), told("TZ")])
+    translation = np.array([-value("Baseline", None), value("TY"), value("TZ")])
     return Content("a ZED settings file", (both[0], both[1]), (rotation, translation), unit="mm")
 
 

@@ -31,10 +31,10 @@ def sources():
 def test_private_parts_of_numba_are_used_where_it_is_said():
     used: dict[str, set[str]] = {}
     for name, text in sources():
-        found = set(re.findall(r"""["']?(_nrt|forceinline)["']?\s*[=:]""", text))
-        found |= set(re.findall(r"^from (numba\.cuda|numba\.core\.caching) import", text, flags=re.M))
-        if found:
-            used[name] = found
+        parts = set(re.findall(r"""["']?(_nrt|forceinline)["']?\s*[=:]""", text))
+        parts |= set(re.findall(r"^from (numba\.cuda|numba\.core\.caching) import", text, flags=re.M))
+        if parts:
+            used[name] = parts
     assert used == PRIVATE
 
 

@@ -92,7 +92,7 @@ def _all_rays(rig: Rig, side: int, size: tuple[int, int]) -> np.ndarray:
 
 
 def texture(points: np.ndarray) -> np.ndarray:
-    """Return the grey level, 0 to 255, of points in space: waves of many directions and lengths, each with its phase."""
+    """Return the grey level, 0 to 255, of points in space: waves of many directions and lengths."""
     rng = np.random.default_rng(5)
     level = np.zeros(points.shape[:-1])
     for _ in range(60):

@@ -130,7 +130,8 @@ def _of_text(text: str, cameras: tuple[int, int] | None, size: Size | None) -> C
         tree = from_json(text)
         if "intrinsic" in tree and "extrinsic" in tree and "baseline" in str(tree["extrinsic"]):
             return from_cityscapes(tree)
-        return None if known_keys(tree) and "fx" not in tree else from_fields(tree)
+        other = '"opencv-matrix"' in text or ("fx" not in tree and known_keys(tree))
+        return None if other else from_fields(tree)
     if re.match(_NUMBERS, start):
         return from_numbers(text)
     if re.search(r"^[ \t]*\[(LEFT|RIGHT)_CAM_\w+\]", text, re.MULTILINE | re.IGNORECASE):

@@ -9,6 +9,7 @@ from importlib.metadata import metadata
 left = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 96), dtype=np.uint8), (0, 0), 1)
 right = np.roll(left, -5, axis=1)
 assert abs(np.median(stereokit.match(left, right, max_disparity=16)) - 5) < 0.1
+assert metadata("stereokit")["License-Expression"] == "MIT"
 cv2.imwrite("left.png", left), cv2.imwrite("right.png", right)
 print("the wheel works alone:", stereokit.__file__, metadata("stereokit")["License-Expression"])
 endef
@@ -23,8 +24,8 @@ $(VENV)/.user: pyproject.toml | $(BIN)/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable ".[refiners,scenes]"
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+$(VENV)/.dev: pyproject.toml refiners/kitti/pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]" --editable refiners/kitti
 	@touch $@ $(VENV)/.user
 
 demo: $(VENV)/.user  ## match a synthetic street with S1 to S4: pictures in demo/ and a table
@@ -48,11 +49,12 @@ lint: $(VENV)/.dev  ## style and the direction of imports
 types: $(VENV)/.dev  ## the strict type checker
 	$(BIN)/mypy
 
-package: $(VENV)/.dev  ## wheel and sdist; the wheel alone, in an empty environment, matches a pair
+package: $(VENV)/.dev  ## wheels and sdists; the main wheel alone, in an empty environment, matches and refines a pair
 	rm -rf dist build/package
 	$(BIN)/python -m hatchling build
+	cd refiners/kitti && ../../$(BIN)/python -m hatchling build -d ../../dist
 	$(PYTHON) -m venv build/package
-	build/package/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	build/package/bin/pip install --quiet --disable-pip-version-check dist/stereokit-*.whl
 	cd build/package && bin/python -c "$$MATCH_A_PAIR" && bin/stereokit match left.png right.png -o map.pfm --max-disparity 16
 
 check: lint types test docs package  ## what CI runs

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.aggregation.contract import Aggregation
-from stereokit.checks import density_warnings, pair_warnings
+from stereokit.checks import PairWatch
 from stereokit.costs.rows import Cost
 from stereokit.cuda.driver import require_device
 from stereokit.defaults import METHODS
@@ -28,7 +28,7 @@ from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit.options import MatchOptions, StageOptions
-from stereokit.pipeline import CpuPipeline, Pipeline
+from stereokit.pipeline import CpuPipeline, Pipeline, concluded, with_blank
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
 
@@ -112,6 +112,7 @@ class Matcher:
             options={**options},
         )
         self._pipeline: Pipeline = _pipeline(settings, device)
+        self._watch = PairWatch()
 
     @property
     def settings(self) -> MatchSettings:
@@ -189,6 +190,7 @@ class Matcher:
         if state["device"] == "cuda":
             require_device()
         self._pipeline = _pipeline(state["settings"], state["device"])
+        self._watch = PairWatch()
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
@@ -227,7 +229,7 @@ class Matcher:
         result: DeviceDisparity = pipeline.match_on_device(left, right, stream)
         return result
 
-    def __call__(self, left: Any, right: Any) -> Disparity:
+    def __call__(self, left: Any, right: Any, *, mask: Any = None, right_mask: Any = None) -> Disparity:
         """Match a rectified pair.
 
         Parameters
@@ -235,35 +237,39 @@ class Matcher:
         left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
             Grey, RGB or RGBA, of one size and type; never modified. One may be grey and the other in colour: both are
             matched in grey. Pixels that are NaN, infinite, `nodata`, of alpha 0 or evident marks such as -3.4e38
-            have no evidence.
+            have no evidence; nor have black borders, as rectification leaves them.
+        mask, right_mask : (H, W) bool, optional
+            True where a pixel of the left, and of the right image is usable. The others have no evidence.
 
         Returns
         -------
         Disparity
             Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, on request,
-            ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
-            a filled map is `min_disparity` everywhere.
+            ``confidence`` and the ``right`` view's map. Pixels without evidence are NaN, also where the rest is filled.
+            Where no pixel at all could be measured (blank images), a filled map is `min_disparity` everywhere.
 
         Warns
         -----
         PairWarning
-            If both images are the same, or hardly anything could be measured; see `stereokit.checks`.
+            If the pair looks as if it were not rectified, exchanged, given twice or out of range; see
+            `stereokit.check_pair`, which tells more.
         StereokitWarning
             If few grey levels hold nearly all pixels of images of more than 8 bits.
 
         Raises
         ------
         InputError
-            If the images cannot be used.
+            If the images or a mask cannot be used.
         """
-        result = self._call(left, right, self.threads)
-        for line in pair_warnings(left, right, result, self.min_disparity, self.max_disparity):
+        result, lines = self._call(left, right, mask, right_mask, self.threads)
+        for line in lines:
             warn(line, PairWarning)
         return result
 
     def map(
-        self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None
-    ) -> Iterator[Disparity]:
+        self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None,
+        mask: Any = None, right_mask: Any = None,
+    ) -> Iterator[Disparity]:  # fmt: skip
         """Match a sequence of pairs, several frames at a time, one thread each.
 
         Frames in parallel use the processors better than threads within a frame, and any number of them. The
@@ -276,6 +282,8 @@ class Matcher:
             that memory stays bounded however long the sequence is.
         progress : callable or None
             Called with the number of results so far, after each.
+        mask, right_mask : (H, W) bool, optional
+            Usable pixels of all left, and of all right images.
 
         Yields
         ------
@@ -284,14 +292,14 @@ class Matcher:
         Warns
         -----
         PairWarning
-            At the first pair of which hardly anything could be measured.
+            At the first pair that looks wrong.
 
         Raises
         ------
         InputError
             When the turn comes of a pair that cannot be used.
         """
-        queue: deque[Job[Disparity]] = deque()
+        queue: deque[Job[tuple[Disparity, list[str]]]] = deque()
         source = iter(pairs)
         # On a GPU each worker has its own buffers.
         workers = Workers(self.threads if self.device == "cpu" else min(2, self.threads))
@@ -308,16 +316,16 @@ class Matcher:
                     except Exception as error:
                         failure = error
                     else:
-                        queue.append(Job(self._call, left, right, 1))
+                        queue.append(Job(self._call, left, right, mask, right_mask, 1))
                         workers.submit(queue[-1])
                 if not queue:
                     if isinstance(failure, StopIteration):
                         return
                     assert failure is not None
                     raise failure
-                result = queue[0].result()
+                result, lines = queue[0].result()
                 queue.popleft()
-                for line in density_warnings(result.density, self.min_disparity, self.max_disparity):
+                for line in lines:
                     if not has_warned:
                         warn(f"pair {count - 1}: {line}", PairWarning)
                     has_warned = True
@@ -329,19 +337,37 @@ class Matcher:
                 job.withdraw()
             workers.close()
 
-    def _call(self, left: Any, right: Any, threads: int) -> Disparity:
+    def _call(self, left: Any, right: Any, mask: Any, right_mask: Any, threads: int) -> tuple[Disparity, list[str]]:
+        """Match a pair; return the map and the warnings about them."""
         with span("prepare", "checks and grey"):
-            pair = gray_pair(left, right, self.settings.nodata)
-        return self.match_gray(pair, threads)
+            pair = gray_pair(left, right, self.settings.nodata, mask, right_mask)
+        result = self.match_gray(pair, threads)
+        with span("clean", "signs of a bad pair"):
+            lines = self._watch.warnings(pair, result, self.min_disparity, self.max_disparity)
+        return result, lines
 
-    def match_gray(self, pair: GrayPair, threads: int) -> Disparity:
-        """Match a checked grey pair."""
-        left_view = self._pipeline.match(pair, threads)
+    def match_gray(self, pair: GrayPair, threads: int, keeps_blank: bool | None = None) -> Disparity:
+        """Match a pair that was checked and is grey.
+
+        Parameters
+        ----------
+        pair : GrayPair
+        threads : int
+        keeps_blank : bool or None
+            Whether pixels without texture keep the value that their neighbours gave them, although they do not count as
+            measured; None asks whether the map is filled.
+        """
+        keeps = self.settings.fill is not None if keeps_blank is None else keeps_blank
+        full = self._match_view(pair, threads, keeps)
         if not self.settings.right:
-            return left_view
-        right_view = self._pipeline.match(_mirror(pair), threads)
-        right = np.ascontiguousarray(right_view.disparity[:, ::-1])
-        return Disparity(left_view.disparity, left_view.valid, left_view.confidence, right)
+            return full
+        mirrored = self._match_view(_mirror(pair), threads, keeps)
+        other = np.ascontiguousarray(mirrored.disparity[:, ::-1])
+        return Disparity(full.disparity, full.valid, full.confidence, other)
+
+    def _match_view(self, pair: GrayPair, threads: int, keeps_blank: bool) -> Disparity:
+        pair = with_blank(pair, self.settings)
+        return concluded(self._pipeline.match(pair, threads), pair, keeps_blank)
 
 
 def _pipeline(settings: MatchSettings, device: str) -> Pipeline:
@@ -371,8 +397,14 @@ _matchers: dict[Any, Matcher] = {}
 _matchers_lock = threading.Lock()
 
 
-def match(left: Any, right: Any, /, method: str = "census+sgm", **options: Unpack[MatchOptions]) -> NDArray[np.float32]:
+def match(
+    left: Any, right: Any, /, method: str = "census+sgm", *, mask: Any = None, right_mask: Any = None,
+    **options: Unpack[MatchOptions],
+) -> NDArray[np.float32]:  # fmt: skip
     """Match a rectified pair and return the left view's disparity map.
+
+    The map is **filled**: where nothing was measured it holds what its surroundings make likely. ``fill=None`` leaves
+    NaN there, and `Matcher` tells which is which.
 
     Parameters
     ----------
@@ -380,13 +412,16 @@ def match(left: Any, right: Any, /, method: str = "census+sgm", **options: Unpac
         Rectified images of one size and type, grey, RGB or RGBA.
     method : str
         ``"cost+aggregation"`` or S1 to S4.
+    mask, right_mask : (H, W) bool, optional
+        True where a pixel of the left, and of the right image is usable.
     **options
         Those of `Matcher`, but ``right``: this returns the left view's map alone.
 
     Returns
     -------
     (H, W) float32, pixels
-        Dense, unless ``fill=None``, which leaves NaN where nothing was measured.
+        Dense but for pixels without evidence (see `Matcher`), which are NaN; with ``fill=None`` all that was not
+        measured is.
 
     Raises
     ------
@@ -400,13 +435,13 @@ def match(left: Any, right: Any, /, method: str = "census+sgm", **options: Unpac
         key = (method, tuple((name, type(values[name]), _file_version(values[name])) for name in sorted(values)))
         hash(key)
     except TypeError:
-        return Matcher(method, **values)(left, right).disparity
+        return Matcher(method, **values)(left, right, mask=mask, right_mask=right_mask).disparity
     with _matchers_lock:
         matcher = _matchers.pop(key, None) or Matcher(method, **values)
         _matchers[key] = matcher  # the most recently used is last
         while len(_matchers) > 4:
             _matchers.pop(next(iter(_matchers)))
-    return matcher(left, right).disparity
+    return matcher(left, right, mask=mask, right_mask=right_mask).disparity
 
 
 def _file_version(option: Any) -> Any:

@@ -6,6 +6,7 @@ may use it at the same time. The pipeline of the GPU is `stereokit.cuda.pipeline
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import CostInput, takes_8_bits
 from stereokit.errors import OptionError
+from stereokit.images.evidence import blank_pixels, joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
 from stereokit.images.resize import reduced, smooth
@@ -24,7 +26,7 @@ from stereokit.result import Disparity
 from stereokit.selection.wta import selection_output
 from stereokit.settings import Detail, MatchSettings
 
-__all__ = ["CpuPipeline", "Pipeline", "refined"]
+__all__ = ["CpuPipeline", "Pipeline", "concluded", "refined", "with_blank"]
 
 _PROBES = (256, 512)
 """Sides of the images that are matched to measure the growth of the buffers, pixels."""
@@ -100,6 +102,47 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 
+def with_blank(pair: GrayPair, settings: MatchSettings) -> GrayPair:
+    """Return the pair with its blank pixels: those around which the left view has no texture as far as a match looks.
+
+    Parameters
+    ----------
+    pair : GrayPair
+        At full size.
+    settings : MatchSettings
+        Of whose cost the window counts, of whose smoothing the kernel, and the size of the matching. Costs that do not
+        say how far they look have no blank pixels.
+    """
+    if settings.reach is None or pair.left_blank is not None:
+        return pair
+    with span("prepare", "blank pixels"):
+        return replace(pair, left_blank=blank_pixels(pair.left, *settings.reach))
+
+
+def concluded(result: Disparity, pair: GrayPair, keeps_blank: bool = True) -> Disparity:
+    """Return a map that says nothing of pixels without evidence, and calls no blank pixel measured.
+
+    Parameters
+    ----------
+    result : Disparity
+        At full size.
+    pair : GrayPair
+    keeps_blank : bool
+        Whether blank pixels keep the value that their neighbours gave them.
+    """
+    bad, blank = pair.left_bad, pair.left_blank
+    unmeasured = joined(bad, blank)
+    if unmeasured is None:
+        return result
+    parts = {"disparity": result.disparity, "valid": result.valid & ~unmeasured}
+    empty = bad if keeps_blank else unmeasured
+    if empty is not None:
+        parts["disparity"] = np.where(empty, np.float32(np.nan), result.disparity)
+    if result.confidence is not None:
+        parts["confidence"] = np.where(unmeasured, np.float32(0), result.confidence)
+    return replace(result, **parts)
+
+
 class CpuPipeline:
     """The pipeline of the CPU.
 
@@ -134,7 +177,7 @@ class CpuPipeline:
                 CostInput(
                     pair.left,
                     pair.right,
-                    pair.left_bad,
+                    joined(pair.left_bad, pair.left_blank),
                     pair.right_bad,
                     levels,
                     settings.border_cost,
@@ -157,6 +200,8 @@ class CpuPipeline:
         with span("clean", "post-processing"):
             chain = settings.post_processing(disparity.size)
             disparity, valid = post_process(disparity, total, pair.left_bad, chain, workspace, threads)
+            if pair.left_blank is not None:
+                valid &= ~pair.left_blank
             if confidence is not None:
                 confidence[~valid] = 0
         return Disparity(disparity, valid, confidence, candidates=candidates)

@@ -29,7 +29,8 @@ class Disparity:
     Parameters
     ----------
     disparity : (H, W) float32
-        Pixels, NaN where invalid. Dense after a fill.
+        Pixels, NaN where invalid. **Filled** unless the matcher has ``fill=None``: then what was not measured holds
+        what its surroundings make likely. `measured` has NaN there.
     valid : (H, W) bool
         True where the disparity was measured, False where it was filled or is invalid.
     confidence : (H, W) float32, optional
@@ -89,6 +90,14 @@ class Disparity:
         good, data = cv2.imencode(".png", self.color()[:, :, ::-1])
         assert good
         return data.tobytes()
+
+    @property
+    def measured(self) -> NDArray[np.float32]:
+        """The map of what was measured alone, (H, W) float32 in pixels: NaN where a value was filled in, or is missing.
+
+        `disparity` is filled by default; this is not.
+        """
+        return np.where(self.valid, self.disparity, np.float32(np.nan))
 
     @property
     def density(self) -> float:

@@ -190,6 +190,16 @@ class MatchSettings:
         return round(1 / self.scale)
 
     @property
+    def reach(self) -> tuple[int, int] | None:
+        """How far a match looks around a pixel, across and down, full-size pixels; None where the cost does not say."""
+        window = getattr(self.cost, "reach", None)
+        if window is None:
+            return None
+        kernel = (round(8 * self.smooth + 1) | 1) // 2 if self.smooth > 0 else 0  # of OpenCV, in 16 bits
+        across, down = (self.step * (side + kernel) + self.step - 1 for side in window)
+        return across, down
+
+    @property
     def floor(self) -> int | None:
         """The minimum, where the levels of a smaller size begin below it: refined maps are raised to it."""
         below = self.step * self.matched_levels.minimum < self.levels.minimum

@@ -33,7 +33,9 @@ from stereokit.methods import parse_method
 
 ROOT = Path(__file__).parents[1]
 CARD = ROOT / "refiners" / "stereokit_refiners" / "weights" / "MODEL_CARD.md"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", CARD, *sorted((ROOT / "docs").glob("*.md"))]
+KITTI = ROOT / "refiners" / "kitti"
+CARDS = [CARD, KITTI / "stereokit_kitti_weights" / "MODEL_CARD.md", KITTI / "README.md"]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *CARDS, *sorted((ROOT / "docs").glob("*.md"))]
 RUN = ("export", "info", "list", "match", "view")
 EXTRAS = {"export": ("onnx", "onnxruntime"), "--refiner": ("openvino",), "view": ("jinja2",)}
 SHELL, OTHER = ("", "shell"), ("text", "toml")
@@ -83,7 +85,7 @@ def folder(street, tmp_path, monkeypatch):
     np.save("right.npy", street.right)
     (tmp_path / "camera.json").write_text('{"fx": 180, "fy": 180, "cx0": 155, "cy": 43, "baseline_m": 0.2}')
     (tmp_path / "mine").mkdir()
-    shutil.copy(CARD.with_name("cnn.safetensors"), tmp_path / "mine" / "weights.safetensors")
+    shutil.copy(KITTI / "stereokit_kitti_weights" / "cnn.safetensors", tmp_path / "mine" / "weights.safetensors")
     return tmp_path
 
 
@@ -109,7 +111,7 @@ def test_the_python_of_a_page_runs(page, street, folder, capsys):
     disparity = scope.get("disparity")
     if isinstance(disparity, np.ndarray):
         assert np.nanmedian(np.abs(disparity - street.disparity)) < 1
-    if page.stem == "README":
+    if page == ROOT / "README.md":
         assert scope["depth_m"].shape == disparity.shape == street.disparity.shape
         assert (folder / "disparity.pfm").exists()
 
@@ -239,7 +241,7 @@ def public_modules() -> set[str]:
 
 INTERNAL = re.compile(
     r"stereokit\.(kernels|cuda|images|methods|io\.|cli\.(?!app))"
-    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|compose|reference|evidence|mixture)"
+    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|reference|evidence|mixture)"
     r"|stereokit_evaluation\.(common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes|generated))"
     r"|.*_cuda$"
 )

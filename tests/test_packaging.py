@@ -10,6 +10,7 @@ import numba
 import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
+from safetensors import safe_open
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("stereokit", "refiners/stereokit_refiners", "evaluation/stereokit_evaluation")
@@ -48,13 +49,34 @@ def test_the_range_of_numba_is_bounded_and_holds_the_installed_one():
     assert Version(numba.__version__) in numba_requirement.specifier
 
 
-def test_the_licence_of_the_weights_is_in_the_metadata():
-    text = (ROOT / "refiners/stereokit_refiners/weights/LICENSE").read_text(encoding="utf-8")
-    expression = metadata("stereokit")["License-Expression"]
-    assert expression == "MIT AND CC-BY-NC-SA-3.0"
-    assert "CC BY-NC-SA 3.0" in text
-    files = metadata("stereokit").get_all("License-File")
-    assert set(files) == {"LICENSE", "refiners/stereokit_refiners/weights/LICENSE"}
+def test_the_licence_is_in_the_metadata():
+    assert metadata("stereokit")["License-Expression"] == "MIT"
+    assert metadata("stereokit").get_all("License-File") == ["LICENSE"]
+
+
+def test_weights_that_are_not_for_commercial_use_are_a_distribution_of_their_own():
+    folder = pytest.importorskip("stereokit_kitti_weights").__path__[0]
+    told = metadata("stereokit-kitti-weights")
+    assert told["License-Expression"] == "CC-BY-NC-SA-3.0"
+    assert "CC BY-NC-SA 3.0" in (ROOT / "refiners/kitti/LICENSE").read_text(encoding="utf-8")
+    assert {path.stem for path in Path(folder).glob("*.safetensors")} == {"cnn", "pyramid", "stereovae"}
+
+
+def test_the_main_distribution_holds_no_weights_trained_on_kitti():
+    weights = [path for package in PACKAGES for path in (ROOT / package).rglob("*.safetensors")]
+    assert [path.name for path in weights] == ["evidence.safetensors"]
+    for path in weights:
+        with safe_open(path, framework="np") as file:
+            assert "kitti" not in file.metadata()["notes"].lower()
+
+
+@pytest.mark.parametrize("kind", ["WheelBuilder", "SdistBuilder"])
+def test_what_is_built_holds_none_either(kind):
+    module = "hatchling.builders." + kind.removesuffix("Builder").lower()
+    builder = getattr(pytest.importorskip(module), kind)(str(ROOT))
+    names = [file.distribution_path for file in builder.recurse_included_files()]
+    assert [name.rpartition("/")[2] for name in names if name.endswith(".safetensors")] == ["evidence.safetensors"]
+    assert not any("kitti_weights" in name for name in names)
 
 
 @pytest.mark.parametrize(("old", "new"), [("evaluation", "scenes"), ("fast", "refiners"), ("large", "tiff")])

@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 
 from stereokit.errors import DeviceError, OptionError, StereokitError, StereokitWarning
 from stereokit.postprocess import fill
+from stereokit.registry import REFINERS
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
 from stereokit_refiners.linear import doubled, enlarged
-from stereokit_refiners.runtimes.compose import compose
 from stereokit_refiners.runtimes.encode import base_of, encode
 from stereokit_refiners.runtimes.evidence import hypotheses, network_input
 from stereokit_refiners.runtimes.mixture import mixture
 from stereokit_refiners.runtimes.reference import TOLERANCES_PX, input_size, mistake
-from stereokit_refiners.weights import WeightFile, network_named, read, shipped
+from stereokit_refiners.weights import WeightFile, find, network_named
 
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
@@ -45,14 +45,15 @@ __all__ = [
     "LearnedRefiner",
     "PyramidRefiner",
     "StereoVaeRefiner",
+    "learned_names",
 ]
 
 BACKENDS = ("openvino", "onnxruntime", "torch")
 PRECISIONS = ("fp32", "bf16", "int8")
-_KEPT = 4  # compiled networks
+_MOST_COMPILED = 4  # networks
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
 
-Run = Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]
+Run = Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]
 """From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
 
 
@@ -63,7 +64,8 @@ class LearnedRefiner:
     Parameters
     ----------
     weights : str or None
-        A weight file; None takes those that come with the package.
+        A weight file, or the name of an installed collection, such as ``"kitti"``; None takes those that come with the
+        package.
     backend : {"auto", "openvino", "onnxruntime", "torch"}
         What runs the network; "auto" is the first that is installed.
     precision : {"auto", "fp32", "bf16", "int8"}
@@ -83,6 +85,8 @@ class LearnedRefiner:
     backend: str = "auto"
     precision: str = "auto"
     architecture: ClassVar[str] = ""
+    needs_weights: ClassVar[bool] = True
+    """Whether `weights` must be given, because none come with the package."""
     _file: WeightFile = field(init=False, repr=False, compare=False)
     _compiled: _Compiled = field(init=False, repr=False, compare=False)
 
@@ -91,22 +95,18 @@ class LearnedRefiner:
             raise OptionError("refiner 'file' needs weights, the path of a .safetensors file, got none")
         if not isinstance(self.weights, (str, os.PathLike, type(None))):
             raise OptionError(f"weights must be the path of a .safetensors file, got {self.weights!r}")
-        self._use(shipped(self.architecture) if self.weights is None else read(self.weights))
+        self._use(find(self.architecture, self.weights))
 
     @classmethod
     def of(cls, content: WeightFile, *, backend: str = "auto", precision: str = "auto") -> LearnedRefiner:
         """Return a refiner of weights that are in memory."""
-        made = object.__new__(cls)
+        refiner = object.__new__(cls)
         for name, value in (("weights", None), ("backend", backend), ("precision", precision)):
-            object.__setattr__(made, name, value)
-        made._use(content)
-        return made
+            object.__setattr__(refiner, name, value)
+        refiner._use(content)
+        return refiner
 
     def _use(self, content: WeightFile) -> None:
-        if self.architecture and content.network != self.architecture:
-            raise OptionError(
-                f"weights of refiner {self.architecture!r} must be its own, got those of {content.network!r}"
-            )
         object.__setattr__(self, "_file", content)
         object.__setattr__(self, "backend", _backend(self.backend))
         object.__setattr__(self, "precision", _precision(self.precision, self.backend, content))
@@ -194,14 +194,14 @@ class LearnedRefiner:
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
         candidates = coarse.candidates if self.needs_candidates else None
-        given = [disparity] if candidates is None else [disparity, candidates]
-        shift = base_of(given)  # whole, so that float32 holds it
+        maps = [disparity] if candidates is None else [disparity, candidates]
+        shift = base_of(maps)  # whole, so that float32 holds it
         self._check_trained(disparity, shift)
         lowered = None if candidates is None else candidates - shift
         full = self.network_map(disparity - shift, lowered, coarse.confidence, left, threads)
         if shift != 0:
             full += 2 * shift
-        np.clip(full, 2 * min(a.min() for a in given), 2 * max(a.max() for a in given), out=full)
+        np.clip(full, 2 * min(a.min() for a in maps), 2 * max(a.max() for a in maps), out=full)
         known = doubled(coarse.valid.view(np.uint8), rows, columns).astype(bool)
         if gaps:
             missing = doubled(unknown.view(np.uint8), rows, columns).astype(bool)
@@ -237,17 +237,15 @@ class LearnedRefiner:
         network = network_named(self._file.network)
         rows, columns = left.shape
         height, width = disparity.shape
-        below, beside = -height % network.multiple, -width % network.multiple
+        below, beside = -height % network.stride, -width % network.stride
         disparity = _extended(disparity * np.float32(2), below, beside)
         confidence = None if confidence is None else _extended(confidence, below, beside)
         image = _extended(left, 2 * (height + below) - rows, 2 * (width + beside) - columns)
-        two = None if candidates is None else _extended_each(candidates * np.float32(2), below, beside)
-        inputs = encode(tuple(network.inputs), self._file.form, disparity, image, confidence, two)
+        candidates = None if candidates is None else _extended_each(candidates * np.float32(2), below, beside)
+        rule = self._file.rule
+        inputs = encode(tuple(network.inputs), rule.unit_inputs, disparity, image, confidence, candidates)
         head = self._compiled.run(inputs, threads)
-        full: NDArray[np.float32] = compose(
-            self._file.network, self._file.form, head, disparity, rows, columns, threads, two
-        )
-        return full
+        return rule.map(head, disparity, rows, columns, threads, candidates)
 
     def _check_trained(self, disparity: NDArray[np.float32], shift: float) -> None:
         """Warn, once, where a map in half-size pixels, lowered by `shift`, goes beyond what was trained."""
@@ -293,8 +291,8 @@ class LearnedRefiner:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
         if self.needs_right:
             raise DeviceError(f"refiner {self._file.network!r} does not work on the device yet: match host images")
-        found: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
-        return found
+        maps: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
+        return maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,11 +300,12 @@ class EvidenceRefiner(LearnedRefiner):
     """The one for every camera: see `stereokit_refiners.networks.evidence`."""
 
     architecture: ClassVar[str] = "evidence"
+    needs_weights: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, eq=False)
 class StereoVaeRefiner(LearnedRefiner):
-    """StereoVAE (Chang et al. 2023), trained on the maps of S1 to S4."""
+    """StereoVAE (Chang et al. 2023); see `stereokit_refiners.networks.stereovae`."""
 
     architecture: ClassVar[str] = "stereovae"
 
@@ -320,9 +319,14 @@ class CnnRefiner(LearnedRefiner):
 
 @dataclass(frozen=True, eq=False)
 class PyramidRefiner(LearnedRefiner):
-    """The network of this project: see `stereokit_refiners.networks.pyramid`."""
+    """A pyramid with a mixture on top: see `stereokit_refiners.networks.pyramid`."""
 
-    architecture: ClassVar[str] = "stereokit"
+    architecture: ClassVar[str] = "pyramid"
+
+
+def learned_names() -> list[str]:
+    """Return the names of the registered refiners that are networks."""
+    return [name for name in REFINERS.names() if getattr(REFINERS.get(name), "architecture", "")]
 
 
 def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:
@@ -337,24 +341,24 @@ def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArra
 
 def _installed() -> list[str]:
     """Return the runtimes that are there, the best first."""
-    there = [b for b in BACKENDS if importlib.util.find_spec(b) is not None]
-    if "onnxruntime" in there and importlib.util.find_spec("onnx") is None:
-        there.remove("onnxruntime")
-    return there
+    installed = [b for b in BACKENDS if importlib.util.find_spec(b) is not None]
+    if "onnxruntime" in installed and importlib.util.find_spec("onnx") is None:
+        installed.remove("onnxruntime")
+    return installed
 
 
 def _backend(name: str) -> str:
     if name != "auto" and name not in BACKENDS:
         raise OptionError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
-    there = _installed()
+    installed = _installed()
     if name == "auto":
-        if not there:
+        if not installed:
             raise StereokitError(
                 "learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[refiners]', or "
                 "'stereokit[onnx]' where OpenVINO has no wheel"
             )
-        return there[0]
-    if name not in there:
+        return installed[0]
+    if name not in installed:
         extra = {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}[name]
         raise StereokitError(f"backend {name!r} is not installed: pip install 'stereokit[{extra}]'")
     return name
@@ -404,12 +408,11 @@ def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, 
                     break
                 wrong.append(f"{way[0]} in {way[1]} is off by {off:.3g} px on average")
             else:
-                told = "; ".join(wrong)
-                raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {told}")
+                reasons = "; ".join(wrong)
+                raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {reasons}")
             if wrong:
-                told = f"since on this machine {'; '.join(wrong)}"
-                told = f"network {content.network!r} is run by {way[0]} in {way[1]}, {told}"
-                warnings.warn(told, RuntimeWarning, stacklevel=5)
+                line = f"network {content.network!r} is run by {way[0]} in {way[1]}, since on this machine "
+                warnings.warn(line + "; ".join(wrong), RuntimeWarning, stacklevel=5)
             _sound[key] = way
         return _sound[key]
 
@@ -435,21 +438,21 @@ class _Compiled:
 
     def __init__(self, content: WeightFile, backend: str, precision: str) -> None:
         self.content, self.backend, self.precision = content, backend, precision
-        self._held: OrderedDict[tuple[int, int, int], Run] = OrderedDict()
+        self._runs: OrderedDict[tuple[int, int, int], Run] = OrderedDict()
         self._lock = threading.Lock()
         self.warned = False
 
-    def run(self, inputs: dict[str, NDArray[np.float32]], threads: int) -> NDArray[np.float32]:
+    def run(self, inputs: dict[str, NDArray[Any]], threads: int) -> NDArray[np.float32]:
         """Return the head for encoded inputs."""
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)
         with self._lock:
-            if not self._held:
+            if not self._runs:
                 self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
-            runner = self._held.pop(key, None) or _compile(
+            runner = self._runs.pop(key, None) or _compile(
                 self.content, self.backend, self.precision, rows, columns, threads
             )
-            self._held[key] = runner
-            while len(self._held) > _KEPT:
-                self._held.popitem(last=False)
+            self._runs[key] = runner
+            while len(self._runs) > _MOST_COMPILED:
+                self._runs.popitem(last=False)
         return runner(inputs)

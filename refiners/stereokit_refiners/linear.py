@@ -48,8 +48,8 @@ class Linear:
 
     def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the map at the size of `left`, on the GPU; see `stereokit_refiners.contract.DeviceRefiner`."""
-        found: tuple[Any, Any, Any] = on_tensors().linear_on_device(coarse, left, stream)
-        return found
+        maps: tuple[Any, Any, Any] = on_tensors().linear_on_device(coarse, left, stream)
+        return maps
 
 
 def doubled(image: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:

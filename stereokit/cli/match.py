@@ -19,6 +19,7 @@ from stereokit.cli.options import (
     RefinerOption,
     ScaleOption,
     SettingsOption,
+    WeightsOption,
     check_fits_png,
     check_json,
     matcher_report,
@@ -49,6 +50,7 @@ def match(
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,
     refiner: RefinerOption = None,
+    weights: WeightsOption = None,
     fill: FillOption = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
     device: DeviceOption = "auto",
@@ -94,7 +96,7 @@ def match(
     if (ply is None) != (calibration is None):
         raise OptionError("--ply and --calibration go together, got only one of them")
     options = parse_settings(settings or [])
-    flags = {"fill": fill, "right": right and True, "confidence": confidence and True}
+    flags = {"fill": fill, "weights": weights, "right": right and True, "confidence": confidence and True}
     options.update({name: value for name, value in flags.items() if value is not None})
     matcher_options: dict[str, Any] = {
         "max_disparity": max_disparity,

@@ -28,6 +28,7 @@ __all__ = [
     "RefinerOption",
     "ScaleOption",
     "SettingsOption",
+    "WeightsOption",
     "check_fits_png",
     "check_json",
     "matcher_report",
@@ -36,13 +37,14 @@ __all__ = [
 ]
 
 _RESERVED_OPTIONS = frozenset(  # not through --set
-    "method max_disparity min_disparity scale refiner fill threads device right confidence".split()
+    "method max_disparity min_disparity scale refiner weights fill threads device right confidence".split()
 )
 MethodOption = Annotated[str, typer.Option("--method", "-m", help="cost+aggregation, S1 to S4.")]
 MaxDisparityOption = Annotated[int, typer.Option(help="Disparities searched end below this, pixels.")]
 MinDisparityOption = Annotated[int, typer.Option(help="Disparities searched start here, pixels.")]
 ScaleOption = Annotated[float, typer.Option(help="Match at this size, such as 0.5.")]
 RefinerOption = Annotated[str | None, typer.Option(help="Brings a scaled map to full size; see list.")]
+WeightsOption = Annotated[str | None, typer.Option(help="Of the refiner: a file, or a collection such as kitti.")]
 FillOption = Annotated[str | None, typer.Option(help="Of invalid pixels: nearest, background, none.")]
 DeviceOption = Annotated[str, typer.Option(help="auto (the CPU, for now), cpu or cuda.")]
 SettingsOption = Annotated[

@@ -70,6 +70,12 @@ class Census:
         return width * height - 1
 
     @property
+    def reach(self) -> tuple[int, int]:
+        """Half of the window across and down, pixels."""
+        width, height = WINDOWS[self.window]
+        return width // 2, height // 2
+
+    @property
     def unit(self) -> int:
         """Penalties are given in neighbours that differ: one unit of cost."""
         return 1

@@ -130,6 +130,11 @@ class Zncc:
         return self.steps
 
     @property
+    def reach(self) -> tuple[int, int]:
+        """Half of the window across and down, pixels."""
+        return self.window // 2, self.window // 2
+
+    @property
     def unit(self) -> int:
         """Penalties are given on the scale of C = min(1 - rho, 1), which `steps` units of cost make up."""
         return self.steps

@@ -21,8 +21,10 @@ from stereokit.cuda.dry import DryQueue
 from stereokit.cuda.kernel import KERNELS, Kernel, Queue, blocks_for, cuda
 from stereokit.cuda.stream import DeviceQueue, stream_of
 from stereokit.errors import DeviceError, InputError
+from stereokit.images.evidence import joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.prepare_cuda import flip, halve, smooth, take
+from stereokit.images.resize import reduced_mask
 from stereokit.kernels.workspace import Pool
 from stereokit.pipeline import refined
 from stereokit.postprocess.chain_cuda import post_process, raise_to
@@ -164,18 +166,26 @@ class CudaPipeline:
             dtype = pair.left.dtype
             images = queue.upload("images", np.stack([pair.left, pair.right]))
             guide = images[: height * width] if dtype == np.uint8 else queue.upload("guide", pair.guide)
-            bad = None
-            if pair.left_bad is not None or pair.right_bad is not None:
+            bad = excluded = None
+            left_bad = joined(pair.left_bad, pair.left_blank)
+            if left_bad is not None or pair.right_bad is not None:
                 none = np.zeros(shape, np.bool_)
-                masks = (none if mask is None else mask for mask in (pair.left_bad, pair.right_bad))
+                masks = (none if mask is None else mask for mask in (left_bad, pair.right_bad))
                 bad = queue.upload("bad", np.stack(list(masks)).view(np.uint8))
-            found, shape = self.run(queue, images, dtype, guide, bad, (height, width), pair.ranges)
+            if pair.left_blank is not None:  # has no cost of its own, but a value
+                excluded = queue.upload("excluded", (none if pair.left_bad is None else pair.left_bad).view(np.uint8))
+            found, shape = self.run(queue, images, dtype, guide, bad, (height, width), pair.ranges, excluded)
             disparity, valid = queue.fetch(found.disparity), queue.fetch(found.valid).view(np.bool_)
             confidence = None if found.confidence is None else queue.fetch(found.confidence).reshape(shape)
             candidates = None
             if found.candidates is not None:
                 candidates = queue.fetch(found.candidates).reshape(2, *shape)
-        return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence, candidates=candidates)
+        valid = valid.reshape(shape)
+        blank = reduced_mask(pair.left_blank, self.settings.step)
+        if blank is not None:
+            valid = valid & ~blank
+            confidence = None if confidence is None else np.where(blank, np.float32(0), confidence)
+        return Disparity(disparity.reshape(shape), valid, confidence, candidates=candidates)
 
     def match_on_device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
         """Match a pair that lies on the device, and wait for nothing.
@@ -246,7 +256,7 @@ class CudaPipeline:
 
     def run(
         self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
-        ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
+        ranges: tuple[tuple[int, int], tuple[int, int]] | None = None, excluded: Any = None,
     ) -> tuple[_Found, Shape]:  # fmt: skip
         """Run all stages on grey images that a queue holds; return the maps and their size.
 
@@ -266,6 +276,8 @@ class CudaPipeline:
             Height and width, pixels, before halving.
         ranges : ((int, int), (int, int)) or None
             As of `stereokit.costs.rows.Pair`.
+        excluded : (H * W,) uint8 on the device, or None
+            Not 0 where a pixel of the left view gets no value; None is where it is `bad`.
         """
         settings, levels = self.settings, self.settings.matched_levels
         if settings.scale != 1:
@@ -273,6 +285,8 @@ class CudaPipeline:
             images = halve(queue, "half.images", images, dtype, 2, shape, False)
             if bad is not None:
                 bad = halve(queue, "half.bad", bad, np.dtype(np.uint8), 2, shape, True)
+            if excluded is not None:
+                excluded = halve(queue, "half.excluded", excluded, np.dtype(np.uint8), 1, shape, True)
             shape = (shape[0] + 1) // 2, (shape[1] + 1) // 2
         height, width = shape
         pixels = height * width
@@ -299,7 +313,7 @@ class CudaPipeline:
         candidates = None
         if settings.detail >= Detail.CANDIDATES:
             confidence, candidates = confidence[:pixels], confidence[pixels:]
-        left_bad = None if bad is None else bad[:pixels]
+        left_bad = excluded if excluded is not None or bad is None else bad[:pixels]
         chain = settings.post_processing(pixels)
         disparity, valid = post_process(queue, maps.disparity, maps.cost, left_bad, chain, shape)
         if settings.detail == Detail.DISPARITY:

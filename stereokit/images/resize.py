@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,7 +15,7 @@ from stereokit.images.intensity import scale_guide
 from stereokit.kernels.threads import run
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["half_size", "reduced", "smooth"]
+__all__ = ["half_size", "reduced", "reduced_mask", "smooth"]
 
 
 def smooth(
@@ -39,7 +40,7 @@ def smooth(
     """
     if eight_bits and pair.left.dtype != np.uint8:
         left, right = scale_guide(pair.left, *pair.span), scale_guide(pair.right, *pair.span)
-        pair = GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide)
+        pair = replace(pair, left=left, right=right, ranges=None, span=(0, 65535))
     if sigma == 0:
         return pair
     buffers = workspace or Workspace()
@@ -54,7 +55,7 @@ def smooth(
 
     run([partial(blur, 0), partial(blur, 1)], threads)
     left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
-    return GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide, pair.ranges, pair.span)
+    return replace(pair, left=left, right=right)
 
 
 def reduced(pair: GrayPair, step: int) -> GrayPair:
@@ -76,13 +77,22 @@ def half_size(pair: GrayPair) -> GrayPair:
         size = (even.shape[1] // 2, even.shape[0] // 2)
         return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0])
 
-    def shrink_bad(bad: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-        if bad is None:
-            return None
-        height, width = bad.shape
-        even = np.pad(bad, ((0, height % 2), (0, width % 2)))
-        return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))
-
     left, right = shrink(pair.left), shrink(pair.right)
     guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
-    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide, pair.ranges, pair.span)
+    masks = {name: _half_mask(getattr(pair, name)) for name in ("left_bad", "right_bad", "left_blank")}
+    return replace(pair, left=left, right=right, guide=guide, **masks)
+
+
+def reduced_mask(mask: NDArray[np.bool_] | None, step: int) -> NDArray[np.bool_] | None:
+    """Return a mask at 1/`step` of its size, as `reduced` does it."""
+    while step > 1:
+        mask, step = _half_mask(mask), step // 2
+    return mask
+
+
+def _half_mask(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    if mask is None:
+        return None
+    height, width = mask.shape
+    even = np.pad(mask, ((0, height % 2), (0, width % 2)))
+    return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))

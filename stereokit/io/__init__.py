@@ -5,10 +5,12 @@ from stereokit.io.disparity import DISPARITY_SUFFIXES, from_opencv, read_dispari
 from stereokit.io.images import IMAGE_SUFFIXES, READABLE_SUFFIXES, read_image, read_pair, write_image
 from stereokit.io.ply import write_ply
 from stereokit.io.reading import parsing, read_bytes, read_json, read_npy, read_text
+from stereokit.io.views import LAYOUTS, read_views, split_views
 
 __all__ = [
     "DISPARITY_SUFFIXES",
     "IMAGE_SUFFIXES",
+    "LAYOUTS",
     "READABLE_SUFFIXES",
     "check_output",
     "from_opencv",
@@ -21,7 +23,9 @@ __all__ = [
     "read_npy",
     "read_pair",
     "read_text",
+    "read_views",
     "replacing",
+    "split_views",
     "to_opencv",
     "write_bytes",
     "write_disparity",

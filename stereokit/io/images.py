@@ -28,9 +28,11 @@ __all__ = [
     "TIFF_STARTS",
     "check_orientations",
     "decode",
+    "decode_bytes",
     "describe",
     "encode",
     "open_tiff",
+    "plain_image",
     "read_image",
     "read_oriented",
     "read_pair",
@@ -54,7 +56,7 @@ TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # its log repeats its exceptions
 
 
-def read_image(path: str | os.PathLike[str], gray: bool = False) -> NDArray[Any]:
+def read_image(path: str | os.PathLike[str], gray: bool = False, alpha: bool = False) -> NDArray[Any]:
     """Read an image as viewers show it.
 
     Parameters
@@ -64,22 +66,25 @@ def read_image(path: str | os.PathLike[str], gray: bool = False) -> NDArray[Any]
         with ``stereokit[tiff]``.
     gray : bool
         Turn colour into grey (0.299 R + 0.587 G + 0.114 B).
+    alpha : bool
+        Keep the alpha channel of a picture that has transparent pixels, which `stereokit.match` then leaves out. Of a
+        TIFF it is dropped, whose fourth channel may be anything.
 
     Returns
     -------
-    (H, W) or (H, W, 3) uint8, uint16, float32 or float64
-        Grey or RGB. Alpha is dropped, palettes are resolved, orientation tags are applied.
+    (H, W), (H, W, 3) or, with `alpha`, (H, W, 4) uint8, uint16, float32 or float64
+        Grey, RGB or RGBA. Palettes are resolved, orientation tags are applied.
 
     Raises
     ------
     FileError
         If the file is missing or is not an image of these types.
     """
-    return read_oriented(path, gray)[0]
+    return read_oriented(path, gray, alpha)[0]
 
 
 def read_pair(
-    left: str | os.PathLike[str], right: str | os.PathLike[str], gray: bool = False
+    left: str | os.PathLike[str], right: str | os.PathLike[str], gray: bool = False, alpha: bool = False
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Read the two images of a pair, as `read_image`; warn where their orientation tags differ.
 
@@ -88,7 +93,7 @@ def read_pair(
     FileError
         If a file is missing or is not an image.
     """
-    (a, tag_a), (b, tag_b) = (read_oriented(path, gray) for path in (left, right))
+    (a, tag_a), (b, tag_b) = (read_oriented(path, gray, alpha) for path in (left, right))
     check_orientations(tag_a, tag_b)
     return a, b
 
@@ -103,7 +108,7 @@ def check_orientations(left: int, right: int) -> None:
         )
 
 
-def read_oriented(path: str | os.PathLike[str], gray: bool = False) -> tuple[NDArray[Any], int]:
+def read_oriented(path: str | os.PathLike[str], gray: bool = False, alpha: bool = False) -> tuple[NDArray[Any], int]:
     """Return an image as `read_image` does, and the orientation tag that was applied.
 
     Raises
@@ -112,16 +117,32 @@ def read_oriented(path: str | os.PathLike[str], gray: bool = False) -> tuple[NDA
         If the file is missing or is not an image.
     """
     image, tag = decode(path)
+    return plain_image(path, image, gray, alpha), tag
+
+
+def plain_image(
+    path: str | os.PathLike[str], image: NDArray[Any], gray: bool = False, alpha: bool = False
+) -> NDArray[Any]:
+    """Return a decoded image as `read_image` does: of an accepted type, grey or RGB, RGBA if wanted.
+
+    Raises
+    ------
+    FileError
+        If it has another type or number of channels.
+    """
     kind = accepted_type(image.dtype)
     if kind is None:
         raise FileError(f"{str(path)!r} holds {image.dtype} pixels, expected whole or floating-point numbers")
     image = image.astype(kind, copy=False)
     if image.ndim == 2 or image.shape[2] == 1:
-        return np.ascontiguousarray(image.reshape(image.shape[:2])), tag
+        return np.ascontiguousarray(image.reshape(image.shape[:2]))
     if image.shape[2] not in (3, 4):
         raise FileError(f"{str(path)!r} has {image.shape[2]} channels, expected grey or colour")
     colors = np.ascontiguousarray(image[:, :, :3])
-    return (to_gray(colors) if gray else colors), tag
+    colors = to_gray(colors) if gray else colors
+    if alpha and image.shape[2] == 4 and not image[:, :, 3].all():
+        return np.dstack([colors if colors.ndim == 3 else [colors] * 3, image[:, :, 3]])
+    return colors
 
 
 def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:
@@ -158,14 +179,18 @@ def write_image(path: str | os.PathLike[str], array: ArrayLike) -> None:
 
 
 def decode(path: str | os.PathLike[str]) -> tuple[NDArray[Any], int]:
-    """Return an image of any type, grey or RGB, as viewers show it, and its orientation tag.
+    """Return an image of any type, grey, RGB or RGBA, as viewers show it, and its orientation tag.
 
     Raises
     ------
     FileError
         If the file is missing or is not an image.
     """
-    data = read_bytes(path)
+    return decode_bytes(path, read_bytes(path))
+
+
+def decode_bytes(path: str | os.PathLike[str], data: bytes) -> tuple[NDArray[Any], int]:
+    """Return the image that a file of this content holds; see `decode`."""
     with parsing(path, "image"):
         if data.startswith(NPY_START):
             image, tag = read_npy(path, data), UPRIGHT
@@ -225,7 +250,9 @@ def _with_opencv(data: bytes) -> NDArray[Any] | None:
         return None
     if image is None:
         return None
-    return image[:, :, 2::-1] if image.ndim == 3 and image.shape[2] > 2 else image
+    if image.ndim == 2 or image.shape[2] < 3:
+        return image
+    return np.asarray(image[:, :, [2, 1, 0, 3][: image.shape[2]]])
 
 
 def _with_tifffile(path: str | os.PathLike[str], data: bytes) -> NDArray[Any]:

@@ -13,16 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.checks import same_pixels
+from stereokit.checks import PairWatch, density_warnings, same_pixels, view_warnings
+from stereokit.images.evidence import joined
 from stereokit.images.intensity import IntensityMapping
-from stereokit.large.intensity import Ranges, read_pair
+from stereokit.large.intensity import MaskedSource, Ranges, read_pair
 from stereokit.large.plan import Plan, Span
-from stereokit.large.sources import Source
 from stereokit.matching import Matcher
+from stereokit.pipeline import with_blank
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows
 
 __all__ = ["BandAssembler"]
+
+_OF_WINDOWS = ("only", "no pixel", "left and right hold the same pixels")
+"""Beginnings of warnings that a window alone, of nothing but water, may have."""
 
 
 class BandAssembler:
@@ -31,7 +35,7 @@ class BandAssembler:
     Parameters
     ----------
     matcher : Matcher
-    sources : (Source, Source)
+    sources : (MaskedSource, MaskedSource)
     mapping : IntensityMapping
     ranges : ((int, int), (int, int)) or None
         See `stereokit.large.intensity.find_ranges`.
@@ -50,17 +54,19 @@ class BandAssembler:
     def __init__(
         self,
         matcher: Matcher,
-        sources: tuple[Source, Source],
+        sources: tuple[MaskedSource, MaskedSource],
         mapping: IntensityMapping,
         ranges: Ranges | None,
         windows: Plan,
         progress: Callable[[int, int], object] | None,
     ) -> None:
         self.measured, self.views_equal = 0, True
+        self._usable, self._watch, self._lines = 0, PairWatch(), list[str]()
         self._image_matcher, self._sources, self._mapping, self._ranges = matcher, sources, mapping, ranges
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
         self._window_matcher = _window_matcher(matcher, (self._height, self._width), windows.window)
+        self._range = matcher.min_disparity, matcher.max_disparity
         self._halo = matcher.settings.median // 2 if matcher.refiner is None else 0
         self._last_row: NDArray[np.float32] | None = None  # row that a band without any valid pixel is filled from
 
@@ -72,25 +78,50 @@ class BandAssembler:
             top = max(row.first - self._halo, row.start)
             bottom = min(row.last + self._halo, row.stop)
             band = np.empty((bottom - top, self._width), np.float32)
+            empty = np.zeros(band.shape, np.bool_)
             for column in self._windows.columns:
-                self._match(row, column, top, band)
+                self._match(row, column, top, band, empty)
                 done += 1
                 if self._progress is not None:
                     self._progress(done, total)
             band = self._finished(band)
+            band[empty] = np.nan
             yield band[row.first - top : row.last - top]
-            del band
+            del band, empty
 
-    def _match(self, row: Span, column: Span, top: int, band: NDArray[np.float32]) -> None:
-        """Match one window and copy its inner part into a band that begins at row `top`."""
+    def _match(
+        self, row: Span, column: Span, top: int, band: NDArray[np.float32], empty: NDArray[np.bool_]
+    ) -> None:  # fmt: skip
+        """Match one window and copy its inner part into a band that begins at row `top`, and where that stays empty."""
         window = row.start, row.stop, column.start, column.stop
         pair = read_pair(*self._sources, self._mapping, window, self._ranges)
         self.views_equal = self.views_equal and same_pixels(pair.left, pair.right)
-        result = self._window_matcher.match_gray(pair, self._window_matcher.threads)
+        pair = with_blank(pair, self._window_matcher.settings)
+        result = self._window_matcher.match_gray(pair, self._window_matcher.threads, keeps_blank=True)
         columns = slice(column.first - column.start, column.last - column.start)
         rows = slice(top - row.start, top - row.start + len(band))
         band[:, column.first : column.last] = result.disparity[rows, columns]
-        self.measured += int(np.count_nonzero(result.valid[row.first - row.start : row.last - row.start, columns]))
+        filled = self._image_matcher.settings.fill is not None
+        without = joined(pair.left_bad, None if filled else pair.left_blank)
+        if without is not None:
+            empty[:, column.first : column.last] = without[rows, columns]
+        inner = np.s_[row.first - row.start : row.last - row.start, columns]
+        self._usable += pair.left[inner].size
+        if pair.left_bad is not None:
+            self._usable -= int(np.count_nonzero(pair.left_bad[inner]))
+        if not self._lines:
+            self._lines = self._watch.warnings(pair, result, *self._range)
+        self.measured += int(np.count_nonzero(result.valid[inner]))
+
+    def warnings(self) -> list[str]:
+        """Return the warnings about the pair and its map, a line each, when all windows are matched."""
+        if self.views_equal:
+            return view_warnings(True)
+        if not self._usable:
+            return ["no pixel is usable: mask, no-data value, alpha or black borders exclude them all"]
+        density = density_warnings(self.measured / self._usable, *self._range)
+        closer = [line for line in self._lines if not line.startswith(_OF_WINDOWS)]
+        return (closer or density) if density or any(line.startswith("rows") for line in closer) else []
 
     def _finished(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
         settings = self._image_matcher.settings

@@ -8,17 +8,19 @@ need none.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.images.gray import GrayPair
+from stereokit.images.evidence import black_border, joined, neutral, unusable
+from stereokit.images.gray import GrayPair, gray_of
 from stereokit.images.intensity import IntensityMapping, find_mapping
 from stereokit.images.resize import reduced, smooth
 from stereokit.large.sources import Source
 
-__all__ = ["BLOCK_NBYTES", "Ranges", "find_ranges", "intensity_mapping", "read_pair"]
+__all__ = ["BLOCK_NBYTES", "MaskedSource", "Ranges", "find_ranges", "intensity_mapping", "read_pair"]
 
 BLOCK_NBYTES = 2**22
 """Approximate size of the blocks that are read and converted to grey, bytes."""
@@ -26,14 +28,46 @@ BLOCK_NBYTES = 2**22
 Ranges = tuple[tuple[int, int], tuple[int, int]]
 
 
-def intensity_mapping(left: Source, right: Source, nodata: float | None = None) -> IntensityMapping:
+@dataclass(frozen=True)
+class MaskedSource:
+    """An image, and which of its pixels are usable.
+
+    Attributes
+    ----------
+    image : Source
+    mask : Source or None
+        Not 0 where a pixel is usable; None is everywhere.
+    """
+
+    image: Source
+    mask: Source | None = None
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the image."""
+        return self.image.dtype
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the image."""
+        return self.image.shape
+
+    def read(self, y0: int, y1: int, x0: int, x1: int) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+        """Return a window, and which of its pixels are masked or belong to a black border, None if none do."""
+        block = self.image.read(y0, y1, x0, x1)
+        usable = None if self.mask is None else self.mask.read(y0, y1, x0, x1) != 0
+        excluded = joined(unusable(usable), black_border(block))
+        return (block, None) if excluded is None else (neutral(block, ~excluded), excluded)
+
+
+def intensity_mapping(left: MaskedSource, right: MaskedSource, nodata: float | None = None) -> IntensityMapping:
     """Return the mapping of two images of one type to grey integers, after a few passes over them."""
     return find_mapping(lambda: _blocks(left, right), left.dtype, left.shape, nodata)
 
 
 def read_pair(
-    left: Source,
-    right: Source,
+    left: MaskedSource,
+    right: MaskedSource,
     mapping: IntensityMapping,
     window: tuple[int, int, int, int],
     ranges: Ranges | None = None,
@@ -42,7 +76,7 @@ def read_pair(
 
     Parameters
     ----------
-    left, right : Source
+    left, right : MaskedSource
     mapping : IntensityMapping
     window : tuple of int
         y0, y1, x0, x1.
@@ -56,9 +90,9 @@ def read_pair(
     for source in (left, right):
         image = np.empty(shape, mapping.kind)
         mask: NDArray[np.bool_] | None = None
-        for top, bottom in _rows(source, y0, y1, x1 - x0):
+        for top, bottom in _rows(source.image, y0, y1, x1 - x0):
             rows = slice(top - y0, bottom - y0)
-            image[rows], bad = mapping.apply(source.read(top, bottom, x0, x1))
+            image[rows], bad = gray_of(mapping, *source.read(top, bottom, x0, x1))
             if bad is not None:
                 mask = np.zeros(shape, np.bool_) if mask is None else mask
                 mask[rows] = bad
@@ -72,13 +106,13 @@ def read_pair(
 
 
 def find_ranges(
-    left: Source, right: Source, mapping: IntensityMapping, step: int, sigma: float, threads: int
+    left: MaskedSource, right: MaskedSource, mapping: IntensityMapping, step: int, sigma: float, threads: int
 ) -> Ranges:
     """Return the smallest and the largest value of either image as a cost sees it: in grey, halved, smoothed.
 
     Parameters
     ----------
-    left, right : Source
+    left, right : MaskedSource
     mapping : IntensityMapping
     step : {1, 2, 4}
         Full-size pixels along a pixel of the matched size.
@@ -114,8 +148,15 @@ def _rows(source: Source, y0: int, y1: int, width: int) -> Iterator[tuple[int, i
         top = bottom
 
 
-def _blocks(*sources: Source) -> Iterator[tuple[int, NDArray[Any]]]:
+def _blocks(*sources: MaskedSource) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Yield the blocks of both images that have a usable pixel, or one black row."""
+    usable = False
     for source in sources:
         height, width = source.shape[:2]
-        for top, bottom in _rows(source, 0, height, width):
-            yield top, source.read(top, bottom, 0, width)
+        for top, bottom in _rows(source.image, 0, height, width):
+            block, excluded = source.read(top, bottom, 0, width)
+            if excluded is None or not excluded.all():
+                usable = True
+                yield top, block
+    if not usable:
+        yield 0, np.zeros((1, *sources[0].shape[1:]), sources[0].dtype)

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.checks import density_warnings, view_warnings
-from stereokit.errors import OptionError
+from stereokit.errors import InputError, OptionError
 from stereokit.images.check import check_integer
+from stereokit.images.evidence import checked_mask
 from stereokit.images.gray import check_same
 from stereokit.images.intensity import IntensityMapping
 from stereokit.io.images import check_orientations
 from stereokit.large.bands import BandAssembler
-from stereokit.large.intensity import BLOCK_NBYTES, Ranges, find_ranges, intensity_mapping
+from stereokit.large.intensity import BLOCK_NBYTES, MaskedSource, Ranges, find_ranges, intensity_mapping
 from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes
 from stereokit.large.output import check_large_output, write_bands
 from stereokit.large.plan import Plan, plan
@@ -104,6 +104,8 @@ def match_large(
     memory: int | float | str | None = None,
     overlap: int = OVERLAP,
     progress: Callable[[int, int], object] | None = None,
+    mask: Any = None,
+    right_mask: Any = None,
     **options: Any,
 ) -> LargeResult:
     """Match a rectified pair window by window and write the left view's disparity map as it grows.
@@ -125,6 +127,8 @@ def match_large(
         disparities.
     progress : callable or None
         Called with the number of matched windows and of all windows.
+    mask, right_mask : path or (H, W) bool, optional
+        Usable pixels of the left, and of the right image: True, or not 0 in a file, which is read as the images are.
     **options
         Those of `Matcher`, but ``right`` and ``confidence``.
 
@@ -153,34 +157,52 @@ def match_large(
     sources = open_source("left", left), open_source("right", right)
     check_same(*sources)
     check_orientations(sources[0].orientation, sources[1].orientation)
-    mapping = intensity_mapping(*sources, matcher.settings.nodata)
     height, width = sources[0].shape[:2]
-    windows = _plan(matcher, sources, mapping, overlap, limit, target)
+    views = (
+        MaskedSource(sources[0], _mask_source("mask", mask, (height, width))),
+        MaskedSource(sources[1], _mask_source("right_mask", right_mask, (height, width))),
+    )
+    mapping = intensity_mapping(*views, matcher.settings.nodata)
+    windows = _plan(matcher, views, mapping, overlap, limit, target)
     ranges: Ranges | None = None
     if getattr(matcher.cost, "needs_ranges", False):
-        ranges = find_ranges(*sources, mapping, matcher.settings.step, matcher.settings.smooth, matcher.threads)
-    assembler = BandAssembler(matcher, sources, mapping, ranges, windows, progress)
+        ranges = find_ranges(*views, mapping, matcher.settings.step, matcher.settings.smooth, matcher.threads)
+    assembler = BandAssembler(matcher, views, mapping, ranges, windows, progress)
     write_bands(target, height, width, assembler)
     count = len(windows.rows) * len(windows.columns)
     density = assembler.measured / (height * width)
-    lines = view_warnings(assembler.views_equal)
-    for line in lines or density_warnings(density, matcher.min_disparity, matcher.max_disparity):
+    for line in assembler.warnings():
         warn(line, PairWarning)
     return LargeResult(target, height, width, windows.window, count, overlap, density, matcher)
 
 
+def _mask_source(name: str, mask: Any, shape: tuple[int, int]) -> Source | None:
+    """Return a mask as the source of its windows, None if there is none."""
+    if mask is None:
+        return None
+    if not isinstance(mask, (str, os.PathLike)):
+        mask = checked_mask(name, mask, shape)
+    source = open_source(name, mask)
+    if source.shape != shape:
+        raise InputError(f"{name} must have the size of the images, {shape}, got {source.shape}")
+    return source
+
+
 def _plan(
     matcher: Matcher,
-    sources: tuple[Source, Source],
+    views: tuple[MaskedSource, MaskedSource],
     mapping: IntensityMapping,
     overlap: int,
     limit: int | None,
     target: Path,
 ) -> Plan:
-    height, width = sources[0].shape[:2]
+    height, width = views[0].shape[:2]
+    sources = [view.image for view in views]
+    masks = [view.mask for view in views if view.mask is not None]
     size = mapping.kind.itemsize
     has_masks = (
-        mapping.nodata is not None
+        bool(masks)
+        or mapping.nodata is not None
         or sources[0].dtype != np.uint8
         or any(source.shape[2:] == (4,) for source in sources)
     )
@@ -194,7 +216,7 @@ def _plan(
 
     occupied = resident_nbytes()
     limit = occupied + free_nbytes() // 2 if limit is None else limit
-    window_memory = limit - occupied - _RESERVE_NBYTES - max(source.piece_nbytes for source in sources)
+    window_memory = limit - occupied - _RESERVE_NBYTES - max(source.piece_nbytes for source in [*sources, *masks])
     reach_x = overlap + max(abs(matcher.min_disparity), abs(matcher.max_disparity))
     return plan(height, width, overlap, reach_x, window_memory, needed)
 

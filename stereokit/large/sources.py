@@ -85,7 +85,7 @@ def open_source(name: str, image: Any) -> Source:
     page = _tiled(name, path) if start.startswith(TIFF_STARTS) else None
     if page is not None:
         return _Tiff(name, path, page)
-    array, orientation = read_oriented(path)
+    array, orientation = read_oriented(path, alpha=True)
     array = checked_image(name, array)
     return _Array(array, array.nbytes, orientation)
 

@@ -251,7 +251,7 @@ def _visible(x: NDArray[Any], y: NDArray[Any], raw: Size, rectified: Array) -> N
         return inside
     xy, xx = np.gradient(x)
     yy, yx = np.gradient(y)
-    upright = inside & (xx * yy - xy * yx > 0)
+    upright: NDArray[np.bool_] = inside & (xx * yy - xy * yx > 0)
     count, labels = cv2.connectedComponents(upright.astype(np.uint8), connectivity=4)
     if count <= 2:
         return np.asarray(upright, np.bool_)

@@ -50,7 +50,7 @@ def stand_in(monkeypatch):
 def test_demo_writes_pictures_table_and_figures(stand_in, tmp_path, capsys):
     folder, figures = tmp_path / "deep" / "out", tmp_path / "figures.json"
     demo(folder, seed=1, size="160x90", max_disparity=48, json_file=figures)
-    refined = ["S4-half-stereovae", "S4-half-stereovae_error"]
+    refined = ["S4-half-stereokit", "S4-half-stereokit_error"]
     names = ["S1", "S1_error", "S4", *refined, "S4_error", "left", "overview", "right", "truth"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(f"{name}.png" for name in names)
     scene = module.generate(1, 160, 90, 48)
@@ -60,7 +60,7 @@ def test_demo_writes_pictures_table_and_figures(stand_in, tmp_path, capsys):
         assert cv2.imread(str(folder / f"{name}.png")).shape == (90, 160, 3)
     rows = json.loads(figures.read_text())["results"]
     assert [row["method"] for row in rows] == ["census+dt", "zncc+sgm", "zncc+sgm"]
-    assert [(row["scale"], row["refiner"]) for row in rows] == [(1.0, None), (1.0, None), (0.5, "stereovae")]
+    assert [(row["scale"], row["refiner"]) for row in rows] == [(1.0, None), (1.0, None), (0.5, "stereokit")]
     truth = scene.disparity[(scene.surface > 0) & ~scene.occluded].astype(float)
     error = np.abs(truth - 10)
     row = rows[0]

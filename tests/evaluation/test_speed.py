@@ -392,7 +392,7 @@ def test_a_peer_that_fails_is_left_out_but_a_method_is_not(monkeypatch, one_peer
         (("--runtimes", "cnn"), "runtimes must come with pipeline, got 'cnn' alone"),
         (
             ("--pipeline", "--runtimes", "linear"),
-            "runtimes must be one of stereovae, cnn, stereokit, evidence, got 'linear'",
+            "runtimes must be one of cnn, general, pyramid, stereokit, stereovae, got 'linear'",
         ),
     ],
 )

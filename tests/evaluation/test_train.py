@@ -103,7 +103,7 @@ def test_the_folder_and_the_report(root, tmp_path, trainable):
     names = {p.name for p in out.iterdir()}
     assert names == {"weights.safetensors", "curves.csv", "curves.png", "checkpoint.pt", "cache"}
     content = weights_of(out)
-    assert (content.network, content.form) == ("cnn", "residual")
+    assert (content.network, content.output_mode) == ("cnn", "residual")
     assert content.notes["settings"]["steps"] == 4
     assert content.disparities == (0, content.notes["disparities"][1]) and content.notes["disparities"][1] > 0
     assert "Y" not in content.ranges and len(content.ranges["FE_1"]) == 32
@@ -128,7 +128,7 @@ def test_the_folder_and_the_report(root, tmp_path, trainable):
     assert "S2" in result.output and f"{100 * bad / known:.2f}" in result.output
 
 
-@pytest.mark.parametrize("refiner", ["cnn", "stereokit"])
+@pytest.mark.parametrize("refiner", ["cnn", "pyramid"])
 def test_the_score_is_that_of_the_written_weights_in_a_matcher(root, tmp_path, trainable, refiner):
     """What is reported is what `stereokit.Matcher` with the written file does on the held-out frames."""
     out, report = tmp_path / "out", tmp_path / "report.json"
@@ -203,10 +203,10 @@ def test_the_papers_preset_and_settings_over_it(root, tmp_path, trainable):
     out, report = tmp_path / "out", tmp_path / "r.json"
     trained(root, out, "--frames", "0", "--preset", "paper", "--json", report, refiner="stereovae")
     chosen = json.loads(report.read_text())["settings"]
-    assert (chosen["form"], chosen["divergence"], chosen["learning_rate"]) == ("literal", 256, 5e-4)
+    assert (chosen["output_mode"], chosen["divergence"], chosen["learning_rate"]) == ("direct", 256, 5e-4)
     assert chosen["betas"] == [0.99, 0.999]
     assert chosen["steps"] == 4
-    assert weights_of(out).form == "literal"
+    assert weights_of(out).output_mode == "direct"
 
 
 # --- who is trained on what ----------------------------------------------------------------------------------------
@@ -273,12 +273,14 @@ def test_validation_frames_are_never_trained_on(root, tmp_path, recorded):
 
 
 def test_samples_stay_on_the_disk_until_they_are_drawn(root, tmp_path, recorded, monkeypatch):
-    from stereokit_refiners.training.samples import Shelf
+    from stereokit_refiners.training.samples import SampleFiles
 
     monkeypatch.setattr(training_pairs, "generate", small_scene)
     trained(root, tmp_path / "out", "--frames", "0-1", "--validation", "2", "--streets", "1")
     (call,) = recorded
-    assert all(isinstance(source.samples, Shelf) for source in call.sources) and isinstance(call.looked_at, Shelf)
+    assert all(isinstance(source.samples, SampleFiles) for source in call.sources) and isinstance(
+        call.looked_at, SampleFiles
+    )
 
 
 def test_every_matcher_and_variant_is_there(root, tmp_path, recorded):
@@ -473,9 +475,9 @@ BAD = [
     (["DATA", "--set", "betas=0.9"], ["betas"]),
     (["DATA", "--set", "ema=2"], ["ema"]),
     (["DATA", "--set", "seed=-1"], ["seed"]),
-    (["DATA", "--set", "form=printed"], ["form must be one of"]),
+    (["DATA", "--set", "output_mode=printed"], ["form must be one of"]),
     (["DATA", "--set", "rows=12"], ["multiples of 8"]),
-    (["DATA", "--refiner", "stereokit", "--set", "form=literal"], ["literal"]),
+    (["DATA", "--refiner", "pyramid", "--set", "output_mode=direct"], ["direct"]),
     (["DATA", "--json", "nowhere/r.json"], ["--json"]),
     (["DATA", "--cache", "text.safetensors"], ["text.safetensors"]),
     (["BARE"], ["000000", "no ground truth"]),

@@ -20,7 +20,6 @@ from stereokit.large.sources import open_source
 from stereokit_evaluation.batch.pairs import list_pairs
 from stereokit_evaluation.batch.store import held
 from stereokit_refiners.weights import read as read_weights
-from stereokit_refiners.weights import shipped
 
 __all__ = ["run_file"]
 
@@ -56,8 +55,7 @@ def samples() -> dict[str, tuple[bytes, ...]]:
     kitti = "".join(f"P_rect_0{k}: 7e2 0 6e2 {-380.0 * k} 0 7e2 2e2 0 0 0 1 0\n" for k in range(4))
     middlebury = "cam0=[700 0 320; 0 700 240; 0 0 1]\ncam1=[700 0 330; 0 700 240; 0 0 1]\ndoffs=10\nbaseline=100\n"
     manifest = {"format": 1, "method": "census+sgm", "options": {"max_disparity": 64}, "inputs": ["a", "b"]}
-    weights = Path(read_weights.__code__.co_filename).parent / "weights" / "cnn.safetensors"
-    shipped("cnn")  # fails here if there are none
+    weights = Path(read_weights.__code__.co_filename).parent / "weights" / "evidence.safetensors"
     return {
         ".npy": tuple(npy),
         ".pfm": (b"Pf\n17 12\n-1\n" + disparity.tobytes(), b"Pf\n17 12\n1\n" + disparity.astype(">f4").tobytes()),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from stereokit import Disparity
-from stereokit_refiners.weights import NETWORKS, WeightFile, write
+from stereokit.errors import FileError
+from stereokit_refiners.weights import NETWORKS, WeightFile, find, write
 
 NAN = np.nan
 NAMES = tuple(name for name, network in NETWORKS.items() if "disparity" in network.inputs)
@@ -38,14 +39,22 @@ def flat_ranges(name, bound, leave=()):
     return {layer.name: [float(bound)] * layer.outputs for layer in layers if layer.name not in leave}
 
 
-def random_content(name, seed=0, form="residual", ranges=None, last=0.05):
-    return WeightFile(name, form, random_arrays(name, seed, last), ranges or {}, {"note": "random"})
+def random_content(name, seed=0, output_mode="residual", ranges=None, last=0.05):
+    return WeightFile(name, output_mode, random_arrays(name, seed, last), ranges or {}, {"note": "random"})
 
 
 def weight_file(folder, name, seed=0, **given):
     path = folder / f"{name}-{seed}.safetensors"
     write(path, random_content(name, seed, **given))
     return str(path)
+
+
+def tuned_to_kitti(name):
+    """Return the weights of a network in the package stereokit-kitti-weights, or skip where it is not installed."""
+    try:
+        return find(name, "kitti")
+    except FileError as error:
+        pytest.skip(str(error))
 
 
 def half_of(size):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stereokit_refiners.training import augment
-from stereokit_refiners.training.augment import Views, mirrored, moved_objects, photographed, rescaled
+from stereokit_refiners.training.augment import Views, copy_paste, mirrored, photographed, rescaled
 
 NAN = np.nan
 SIZE = (100, 280)
@@ -93,7 +93,7 @@ def assert_photo_consistent(views):
 
 CHANGES = {
     "mirrored": lambda rng, views: mirrored(views),
-    "moved_objects": moved_objects,
+    "copy_paste": copy_paste,
     "rescaled": rescaled,
     "photographed": photographed,
 }
@@ -243,7 +243,7 @@ def copies_of(views, found, box):
 )
 def test_dense_truth_is_left_alone(views):
     for seed in range(5):
-        assert_equal(moved_objects(np.random.default_rng(seed), views), views)
+        assert_equal(copy_paste(np.random.default_rng(seed), views), views)
 
 
 @pytest.mark.parametrize(
@@ -251,22 +251,22 @@ def test_dense_truth_is_left_alone(views):
 )
 def test_without_objects_nothing_moves(views):
     for seed in range(5):
-        assert_equal(moved_objects(np.random.default_rng(seed), views), views)
+        assert_equal(copy_paste(np.random.default_rng(seed), views), views)
 
 
 def test_what_is_too_large_is_no_object(monkeypatch):
     monkeypatch.setattr(augment, "_LARGEST", CAR.height * CAR.width // 2)
     views = scene(CAR)
     for seed in range(5):
-        assert_equal(moved_objects(np.random.default_rng(seed), views), views)
+        assert_equal(copy_paste(np.random.default_rng(seed), views), views)
 
 
 def test_at_most_as_many_copies_as_are_allowed():
     views = scene(CAR)
-    assert_equal(moved_objects(np.random.default_rng(0), views, most=0), views)
+    assert_equal(copy_paste(np.random.default_rng(0), views, most=0), views)
     counts = set()
     for seed in range(12):
-        found = moved_objects(np.random.default_rng(seed), views, most=1)
+        found = copy_paste(np.random.default_rng(seed), views, most=1)
         counts.add(len(set(copies_of(views, found, CAR)) - {(0, False)}))
     assert counts == {0, 1}
 
@@ -277,7 +277,7 @@ def test_after_moving_both_cameras_still_see_the_same(boxes):
     assert_photo_consistent(views)
     changed = 0
     for seed in range(12):
-        found = moved_objects(np.random.default_rng(seed), views)
+        found = copy_paste(np.random.default_rng(seed), views)
         assert_views(found, SIZE)
         assert_photo_consistent(found)
         changed += not same(found, views)
@@ -287,7 +287,7 @@ def test_after_moving_both_cameras_still_see_the_same(boxes):
 def test_a_copy_stands_on_the_same_rows_at_its_disparity_in_both_views():
     views, moved = scene(CAR), 0
     for seed in range(16):
-        found = moved_objects(np.random.default_rng(seed), views, most=1)
+        found = copy_paste(np.random.default_rng(seed), views, most=1)
         new = set(copies_of(views, found, CAR)) - {(0, False)}
         if not new:  # none was drawn, or it reaches out of the image
             continue
@@ -310,7 +310,7 @@ def test_a_copy_stands_on_the_same_rows_at_its_disparity_in_both_views():
 
 def test_copies_show_both_the_object_and_its_mirror_image():
     views = scene(CAR)
-    found = [moved_objects(np.random.default_rng(seed), views, most=1) for seed in range(20)]
+    found = [copy_paste(np.random.default_rng(seed), views, most=1) for seed in range(20)]
     sides = {flipped for one in found for shift, flipped in set(copies_of(views, one, CAR)) - {(0, False)}}
     assert sides == {False, True}
 
@@ -318,7 +318,7 @@ def test_copies_show_both_the_object_and_its_mirror_image():
 def test_copies_reach_out_of_the_image_at_both_sides():
     views, at_left, at_right = scene(CAR), 0, 0
     for seed in range(40):
-        occ = moved_objects(np.random.default_rng(seed), views, most=1).occ == CAR.d
+        occ = copy_paste(np.random.default_rng(seed), views, most=1).occ == CAR.d
         at_left += occ[CAR.y + 10, 0]
         at_right += occ[CAR.y + 10, -1]
     assert at_left and at_right
@@ -328,7 +328,7 @@ def test_copies_reach_out_of_the_image_at_both_sides():
 def test_what_a_copy_hides_from_the_right_camera_leaves_noc_and_stays_in_occ(boxes):
     views, lost, alike = scene(*boxes), 0, 0
     for seed in range(12):
-        found = moved_objects(np.random.default_rng(seed), views)
+        found = copy_paste(np.random.default_rng(seed), views)
         background = (found.left == views.left) & (found.occ == FAR)
         np.testing.assert_array_equal(views.occ[background], found.occ[background])
         gone = background & np.isfinite(views.noc) & np.isnan(found.noc)
@@ -349,7 +349,7 @@ def test_a_copy_hides_nothing_nearer():
     near = with_pole.occ == POLE.d
     left_out = there = 0
     for seed in range(40):
-        free, barred = (moved_objects(np.random.default_rng(seed), v, most=1) for v in (open_scene, with_pole))
+        free, barred = (copy_paste(np.random.default_rng(seed), v, most=1) for v in (open_scene, with_pole))
         hidden = near & (barred.occ != POLE.d)
         assert hidden.sum() <= 0.02 * CAR.height * CAR.width
         would_hide = (near & (free.occ == CAR.d)).sum() > 0.02 * CAR.height * CAR.width
@@ -362,7 +362,7 @@ def test_a_copy_hides_nothing_nearer():
 def test_a_copy_stands_before_what_is_farther():
     farther = Box(20, 10, 70, 40, 12)
     views = scene(CAR, farther)
-    found = [moved_objects(np.random.default_rng(seed), views) for seed in range(20)]
+    found = [copy_paste(np.random.default_rng(seed), views) for seed in range(20)]
     assert any(((views.occ == farther.d) & (one.occ == CAR.d)).sum() > 200 for one in found)
 
 
@@ -371,7 +371,7 @@ def test_objects_of_several_disparities_move_as_they_are():
     views = scene(Box(30, 110, 48, 32, 20), Box(30, 142, 48, 32, 22))
     kinds = set()
     for seed in range(12):
-        found = moved_objects(np.random.default_rng(seed), views)
+        found = copy_paste(np.random.default_rng(seed), views)
         assert_photo_consistent(found)
         kinds |= {(v, int((found.occ == v).sum()) > int((views.occ == v).sum())) for v in (20, 22)}
     assert {(20, True), (22, True)} <= kinds

@@ -17,7 +17,7 @@ TOLERANCE_PX = 2e-3
 """Between runtimes in fp32, full-size pixels, for maps of some tens of pixels: the order of sums."""
 
 SIZE = (45, 70)
-FORMS = [(name, "residual") for name in NAMES] + [("stereovae", "literal"), ("cnn", "literal")]
+FORMS = [(name, "residual") for name in NAMES] + [("stereovae", "direct"), ("cnn", "direct")]
 
 
 def refined(content, backend, precision="fp32", threads=1, size=SIZE):
@@ -38,10 +38,10 @@ def calibrated(name, seed=0):
 
 
 @pytest.mark.parametrize("backend", ["openvino", "onnxruntime"])
-@pytest.mark.parametrize(("name", "form"), FORMS)
-def test_runtimes_agree(name, form, backend):
+@pytest.mark.parametrize(("name", "mode"), FORMS)
+def test_runtimes_agree(name, mode, backend):
     pytest.importorskip("torch")
-    content = random_content(name, form=form)
+    content = random_content(name, output_mode=mode)
     expected = refined(content, "torch")
     np.testing.assert_allclose(refined(content, backend), expected, rtol=0, atol=TOLERANCE_PX)
     assert np.ptp(expected) > 0.5
@@ -188,4 +188,4 @@ def test_more_sizes_than_are_kept_compiled_give_what_they_did():
     first = [refiner(coarse_of(s), image_of(s)).disparity for s in sizes]
     for size, expected in zip(sizes, first, strict=True):
         np.testing.assert_array_equal(refiner(coarse_of(size), image_of(size)).disparity, expected)
-    assert len(refiner._compiled._held) <= 4
+    assert len(refiner._compiled._runs) <= 4

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from refining import LEARNED, NAMES, coarse_of, half_of, image_of, needs_backend, random_content
 
-import stereokit
-from stereokit.errors import FileError
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.linear import Linear
-from stereokit_refiners.networks.pyramid import CANDIDATES, OFFSETS
-from stereokit_refiners.weights import NETWORKS, shipped
+from stereokit_refiners.networks.pyramid import OFFSETS
+from stereokit_refiners.weights import NETWORKS
 
 pytestmark = needs_backend
 
@@ -24,7 +22,7 @@ CHOICES = [(0, 0, 0, 0), (1, 1, 1, 1), (0, 1, 1, 0), (1, 0, 0, 0)]
 
 def choosing(choice):
     """Return weights of which each phase takes the candidate of `choice`, whatever the network sees."""
-    content = random_content("stereokit", last=0.0)
+    content = random_content("pyramid", last=0.0)
     bias = content.arrays["head.bias"]
     bias[:] = 0
     bias[0] = 5  # corrects the coarse values, not the candidates
@@ -42,9 +40,9 @@ def chosen(candidates, choice, size):
 
 
 def test_there_are_two_beside_the_values_around():
-    assert len(OFFSETS) + 2 == CANDIDATES
-    assert NETWORKS["stereokit"].inputs["candidates"] == 2
-    assert NETWORKS["stereokit"].layers[-1].outputs == 5 + 4 * CANDIDATES
+    assert len(OFFSETS) + 2 == NETWORKS["pyramid"].outputs["residual"].values
+    assert NETWORKS["pyramid"].inputs["candidates"] == 2
+    assert NETWORKS["pyramid"].layers[-1].outputs == 5 + 4 * (len(OFFSETS) + 2)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -96,7 +94,7 @@ def test_candidates_do_not_fill_gaps_of_the_map():
 @pytest.mark.parametrize("size", [(16, 32), (18, 31)])
 def test_candidates_are_read_in_any_layout(size):
     coarse, left = coarse_of(size, 3), image_of(size, 3)
-    refiner = LearnedRefiner.of(random_content("stereokit"), precision="fp32")
+    refiner = LearnedRefiner.of(random_content("pyramid"), precision="fp32")
     expected = refiner(coarse, left).disparity
     wide = np.zeros((2, *half_of(size), 3), np.float32)
     wide[..., 1] = coarse.candidates
@@ -107,12 +105,8 @@ def test_candidates_are_read_in_any_layout(size):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_refiners_say_whether_they_need_them(name):
-    try:
-        shipped(name)
-    except FileError as error:
-        pytest.skip(str(error))
-    assert stereokit.REFINERS.get(name)().needs_candidates is (name == "stereokit")
+def test_refiners_say_whether_they_need_them(name):
+    assert LearnedRefiner.of(random_content(name)).needs_candidates is (name == "pyramid")
 
 
 def test_upscaling_does_not_look_at_them():

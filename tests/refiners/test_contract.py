@@ -1,4 +1,4 @@
-"""The contract of `stereokit_refiners.contract`, for every learned refiner: with random weights, and as shipped."""
+"""The contract of `stereokit_refiners.contract`, for every learned refiner: with random weights, and tuned to KITTI."""
 
 from __future__ import annotations
 
@@ -21,31 +21,29 @@ from refining import (
     one_line,
     random_content,
     sure,
+    tuned_to_kitti,
     weight_file,
 )
 
 import stereokit
 from stereokit import Disparity
-from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit.errors import OptionError, StereokitError
 from stereokit_refiners.learned import LearnedRefiner
-from stereokit_refiners.weights import NETWORKS, shipped
+from stereokit_refiners.weights import NETWORKS
 
 pytestmark = needs_backend
 
 SIZES = [(32, 48), (33, 47), (1, 1), (1, 9), (9, 1), (2, 3), (18, 30), (31, 16)]
 
 
-@pytest.fixture(params=[f"random {name}" for name in NAMES] + [f"shipped {name}" for name in NAMES])
+@pytest.fixture(params=[f"random {name}" for name in NAMES] + [f"kitti {name}" for name in NAMES])
 def refiner(request):
-    """Return each architecture with random weights, and each that is shipped as it is."""
+    """Return each architecture with random weights, and tuned to KITTI."""
     origin, name = request.param.split()
     if origin == "random":
         return LearnedRefiner.of(random_content(name), precision="fp32" if "openvino" in LEARNED else "auto")
-    try:
-        shipped(name)
-    except FileError as error:
-        pytest.skip(str(error))
-    return stereokit.REFINERS.get(name)()
+    tuned_to_kitti(name)
+    return stereokit.REFINERS.get(name)(weights="kitti")
 
 
 @pytest.fixture(params=NAMES)
@@ -74,7 +72,7 @@ def test_refiners_say_what_they_need_beside_the_map(name):
     refiner = LearnedRefiner.of(random_content(name))
     for needs, what in ((refiner.needs_confidence, "confidence"), (refiner.needs_candidates, "candidates")):
         assert needs is (what in NETWORKS[name].inputs)
-        assert needs is (name == "stereokit")
+        assert needs is (name == "pyramid")
 
 
 @pytest.mark.parametrize("missing", ["confidence", "candidates"])
@@ -154,8 +152,8 @@ def test_odd_sizes_are_the_image_extended_by_hand_and_cut(exact, size):
     rows, columns = size
     coarse, left = coarse_of(size, low=0.0, high=6.0), image_of(size)  # begins as maps of the training do
     height, width = half_of(size)
-    multiple = NETWORKS[exact._file.network].multiple
-    below, beside = -height % multiple, -width % multiple
+    stride = NETWORKS[exact._file.network].stride
+    below, beside = -height % stride, -width % stride
     by_hand = Disparity(
         np.pad(coarse.disparity, ((0, below), (0, beside)), mode="edge"),
         np.pad(coarse.valid, ((0, below), (0, beside)), mode="edge"),
@@ -253,7 +251,7 @@ def test_fingerprints_say_what_the_result_depends_on(tmp_path):
     assert first.fingerprint == LearnedRefiner.of(random_content("cnn")).fingerprint
     others = [
         random_content("cnn", 1),
-        random_content("cnn", form="literal"),
+        random_content("cnn", output_mode="direct"),
         random_content("cnn", ranges=flat_ranges("cnn", 2)),
     ]
     found = {LearnedRefiner.of(content, precision="auto").fingerprint for content in others} | {first.fingerprint}

@@ -8,7 +8,7 @@ import pytest
 from refining import one_line
 
 from stereokit.errors import OptionError
-from stereokit_refiners.runtimes.encode import FORMS, check_form, encode, half_image
+from stereokit_refiners.runtimes.encode import encode, half_image
 
 ALL = ("disparity", "image", "confidence", "candidates", "phases")
 
@@ -25,18 +25,18 @@ def given(rows, columns, dtype=np.uint8, seed=0):
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 @pytest.mark.parametrize("size", [(3, 5), (1, 1), (1, 6), (6, 1)])
-@pytest.mark.parametrize("form", FORMS)
-def test_every_input_against_its_formula(form, size, dtype):
+@pytest.mark.parametrize("unit", [False, True])
+def test_every_input_against_its_formula(unit, size, dtype):
     rows, columns = size
     disparity, left, confidence, candidates = arrays = given(rows, columns, dtype)
     kept = [array.copy() for array in arrays]
-    found = encode(ALL, form, disparity, left, confidence, candidates)
+    found = encode(ALL, unit, disparity, left, confidence, candidates)
     assert list(found) == list(ALL)
-    gray = (lambda v: v / 255) if form == "literal" else (lambda v: 4 * (v / 255 - 0.4))
+    gray = (lambda v: v / 255) if unit else (lambda v: 4 * (v / 255 - 0.4))
     for y in range(rows):
         for x in range(columns):
             pixels = [*candidates[:, y, x], disparity[y, x]]
-            scaled = [float(d) / 256 if form == "literal" else float(d) / 16 - 1.5 for d in pixels]
+            scaled = [float(d) / 256 if unit else float(d) / 16 - 1.5 for d in pixels]
             assert found["disparity"][0, y, x] == pytest.approx(scaled[2], abs=1e-6)
             assert list(found["candidates"][:, y, x]) == pytest.approx(scaled[:2], abs=1e-6)
             assert found["confidence"][0, y, x] == pytest.approx(4 * float(confidence[y, x]) - 2, abs=1e-6)
@@ -54,13 +54,13 @@ def test_every_input_against_its_formula(form, size, dtype):
 
 def test_only_what_is_asked_for_is_made():
     names = ("confidence", "disparity")
-    assert list(encode(names, "residual", *given(4, 4))) == list(names)
+    assert list(encode(names, False, *given(4, 4))) == list(names)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_what_was_not_measured_is_minus_2_and_what_is_certain_2(form):
+@pytest.mark.parametrize("unit", [False, True])
+def test_what_was_not_measured_is_minus_2_and_what_is_certain_2(unit):
     confidence = np.float32([[0, 0.5, 1]])
-    found = encode(("confidence",), form, np.zeros((1, 3), np.float32), np.zeros((2, 6), np.uint8), confidence)
+    found = encode(("confidence",), unit, np.zeros((1, 3), np.float32), np.zeros((2, 6), np.uint8), confidence)
     np.testing.assert_array_equal(found["confidence"], [[[-2, 0, 2]]])
 
 
@@ -69,12 +69,12 @@ def test_what_is_missing_is_refused_only_where_it_is_looked_at(missing):
     disparity, left, confidence, candidates = given(4, 4)
     evidence = {"confidence": confidence, "candidates": candidates}
     names = tuple(name for name in ALL if name != missing)
-    without, beside = (encode(names, "residual", disparity, left, **{**evidence, missing: m}) for m in
+    without, beside = (encode(names, False, disparity, left, **{**evidence, missing: m}) for m in
                        (None, evidence[missing]))  # fmt: skip
     for name in names:
         np.testing.assert_array_equal(without[name], beside[name])
     with pytest.raises(OptionError) as caught:
-        encode(ALL, "residual", disparity, left, **{**evidence, missing: None})
+        encode(ALL, False, disparity, left, **{**evidence, missing: None})
     rule = f"coarse must come with {missing} for this refiner, as stereokit.Matcher gives it, got none"
     assert one_line(caught.value) == rule
 
@@ -91,12 +91,6 @@ def test_strided_images_are_read_where_they_are():
     disparity, left, *evidence = given(4, 6)
     wide = np.zeros((8, 24), np.uint8)
     wide[:, ::2] = left
-    plain, strided = (encode(ALL, "residual", disparity, image, *evidence) for image in (left, wide[:, ::2]))
+    plain, strided = (encode(ALL, False, disparity, image, *evidence) for image in (left, wide[:, ::2]))
     for name in ALL:
         np.testing.assert_array_equal(plain[name], strided[name])
-
-
-def test_forms_are_checked():
-    assert [check_form(form) for form in FORMS] == list(FORMS)
-    with pytest.raises(OptionError, match=r"^form must be one of residual, literal, got 'printed'$"):
-        check_form("printed")

@@ -7,20 +7,29 @@ import json
 
 import numpy as np
 import pytest
-from refining import NAMES, coarse_of, flat_ranges, half_of, image_of, network_map, random_content, weight_file
+from refining import (
+    NAMES,
+    coarse_of,
+    flat_ranges,
+    half_of,
+    image_of,
+    network_map,
+    random_content,
+    tuned_to_kitti,
+    weight_file,
+)
 from typer.testing import CliRunner
 
 from stereokit import Disparity
 from stereokit.cli.app import app
-from stereokit.errors import FileError
 from stereokit_refiners.commands import export as module
 from stereokit_refiners.learned import LearnedRefiner
-from stereokit_refiners.weights import NETWORKS, shipped
+from stereokit_refiners.weights import NETWORKS
 
 for _package in ("safetensors", "onnx", "onnxruntime"):
     pytest.importorskip(_package)
 
-FORMS = [(name, "residual") for name in NAMES] + [("stereovae", "literal"), ("cnn", "literal")]
+FORMS = [(name, "residual") for name in NAMES] + [("stereovae", "direct"), ("cnn", "direct")]
 SIZES = [(32, 48), (16, 16), (64, 32)]
 
 
@@ -48,18 +57,18 @@ def feeds(content, size):
     return {name: array.reshape(1, -1, *array.shape[-2:]) for name, array in given.items()}, refined
 
 
-@pytest.mark.parametrize(("name", "form"), FORMS)
-def test_onnx_files_are_the_refiner_at_any_size(name, form, tmp_path):
+@pytest.mark.parametrize(("name", "mode"), FORMS)
+def test_onnx_files_are_the_refiner_at_any_size(name, mode, tmp_path):
     import onnx
     import onnxruntime
 
-    weights, out = weight_file(tmp_path, name, form=form), tmp_path / "model.onnx"
+    weights, out = weight_file(tmp_path, name, output_mode=mode), tmp_path / "model.onnx"
     result = run("-o", out, "--refiner", weights)
     assert result.exit_code == 0, result.output
     onnx.checker.check_model(onnx.load(out), full_check=True)
     session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
     for size in SIZES:
-        given, refined = feeds(random_content(name, form=form), size)
+        given, refined = feeds(random_content(name, output_mode=mode), size)
         (found,) = session.run(["disparity"], given)
         assert found.shape == (1, 1, *size)
         np.testing.assert_allclose(found[0, 0], refined, rtol=0, atol=module.TOLERANCE_PX)
@@ -90,7 +99,7 @@ def test_the_report(tmp_path):
     assert str(out) in result.output.replace("\n", "")
     document = json.loads(report.read_text())
     assert set(document) == {"output", "format", "network", "form", "weights", "largest_difference_px"}
-    assert (document["network"], document["form"], document["format"]) == ("cnn", "residual", "onnx")
+    assert (document["network"], document["output_mode"], document["format"]) == ("cnn", "residual", "onnx")
     assert document["weights"] == random_content("cnn").fingerprint
     assert 0 <= document["largest_difference_px"] <= module.TOLERANCE_PX
     printed = run("-o", out, "--refiner", weights, "--json", "-")
@@ -105,14 +114,15 @@ def test_a_calibrated_file_is_exported_in_full_precision(tmp_path):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_refiners_are_exported_by_name(name, tmp_path):
-    try:
-        shipped(name)
-    except FileError as error:
-        failed(run("-o", tmp_path / "m.onnx", "--refiner", name), f"no weights for '{name}' come with this version")
-        assert not list(tmp_path.iterdir())
-        pytest.skip(str(error))
-    assert run("-o", tmp_path / "m.onnx", "--refiner", name).exit_code == 0
+def test_refiners_are_exported_by_name(name, tmp_path):
+    tuned_to_kitti(name)
+    assert run("-o", tmp_path / "m.onnx", "--refiner", name, "--weights", "kitti").exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["general", "stereokit", "evidence"])
+def test_the_general_refiner_is_refused_in_one_line_that_says_why(name, tmp_path):
+    failed(run("-o", tmp_path / "m.onnx", "--refiner", name), "got 'evidence'", "compiled loops")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -126,7 +136,7 @@ def test_shipped_refiners_are_exported_by_name(name, tmp_path):
         (["-o", "folder.onnx"], ["output must name a file in an existing folder"]),
         (["-o", "m.onnx", "--refiner", "none.safetensors"], ["weights must name a file", "none.safetensors"]),
         (["-o", "m.onnx", "--refiner", "text.safetensors"], ["weights must be a safetensors file"]),
-        (["-o", "m.onnx", "--refiner", "linear"], ["must be one of stereovae, cnn, stereokit", "'linear'"]),
+        (["-o", "m.onnx", "--refiner", "linear"], ["must be one of stereovae, cnn, pyramid", "'linear'"]),
         (["-o", "m.onnx", "--refiner", "cnn-0.safetensors", "--json", "nowhere/r.json"], ["--json"]),
         (["-o", "m.onnx", "--refiner", "cnn-0.safetensors", "--json", "folder.onnx"], ["--json"]),
     ],
@@ -168,11 +178,11 @@ def with_unseen_candidates(content):
 @pytest.mark.parametrize("flaw", [with_swapped_candidates, with_unseen_candidates])
 def test_a_graph_that_takes_the_candidates_for_others_is_not_written(flaw, tmp_path, monkeypatch):
     """The check's own candidates are far from each other, so that such a mistake is no matter of rounding."""
-    wrong, real, out = random_content("stereokit"), module.onnx_model, tmp_path / "m.onnx"
+    wrong, real, out = random_content("pyramid"), module.onnx_model, tmp_path / "m.onnx"
     flaw(wrong)
-    assert module.largest_difference(random_content("stereokit"), real(wrong)) > 50 * module.TOLERANCE_PX
+    assert module.largest_difference(random_content("pyramid"), real(wrong)) > 50 * module.TOLERANCE_PX
     monkeypatch.setattr(module, "onnx_model", lambda content: real(wrong))
-    failed(run("-o", out, "--refiner", weight_file(tmp_path, "stereokit")), "differs from the refiner by")
+    failed(run("-o", out, "--refiner", weight_file(tmp_path, "pyramid")), "differs from the refiner by")
     assert not out.exists()
 
 
@@ -255,7 +265,7 @@ def test_exported_graphs_take_maps_without_gaps_only_as_documented():
     """The pyramid sees the confidence: another confidence is another map."""
     import onnxruntime
 
-    content = random_content("stereokit")
+    content = random_content("pyramid")
     session = onnxruntime.InferenceSession(module.onnx_model(content), providers=["CPUExecutionProvider"])
     size = (32, 32)
     coarse, left = coarse_of(size), image_of(size)

@@ -12,12 +12,12 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from refining import NAMES, encoded_of, random_arrays
+from refining import NAMES, encoded_of, random_arrays, tuned_to_kitti
 
 import stereokit
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.networks.layers import Layer
-from stereokit_refiners.weights import NETWORKS, shipped
+from stereokit_refiners.weights import NETWORKS
 
 pytest.importorskip("openvino")
 
@@ -156,13 +156,12 @@ class Keeping:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_weights_are_as_good_in_8_bits_on_a_street_whose_truth_is_known(name, street):
-    pytest.importorskip("safetensors")
+def test_weights_tuned_to_kitti_are_as_good_in_8_bits_on_a_street_whose_truth_is_known(name, street):
     left, coarse, truth = street
     known = np.isfinite(truth)
     off = {}
     for precision in ("fp32", "int8"):
-        refiner = LearnedRefiner.of(shipped(name), backend="openvino", precision=precision)
+        refiner = LearnedRefiner.of(tuned_to_kitti(name), backend="openvino", precision=precision)
         off[precision] = np.abs(refiner(coarse, left).disparity - truth)[known]
     assert off["int8"].mean() < off["fp32"].mean() + 0.15
     assert (off["int8"] > 3).mean() < (off["fp32"] > 3).mean() + 0.01

@@ -212,8 +212,8 @@ def test_the_papers_networks_are_what_loops_compute(name):
 
 
 def test_the_pyramid_is_what_loops_compute():
-    arrays, inputs = random_arrays("stereokit", 2, last=1.0), encoded_of("stereokit", 8, 16)
-    heads = heads_of(module_of("stereokit", arrays), inputs)
+    arrays, inputs = random_arrays("pyramid", 2, last=1.0), encoded_of("pyramid", 8, 16)
+    heads = heads_of(module_of("pyramid", arrays), inputs)
     assert list(heads) == ["map"]
     close(
         heads["map"],
@@ -275,13 +275,14 @@ def test_first_weights_are_those_of_the_seed(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_reach_every_weight(name):
     torch = pytest.importorskip("torch")
-    from stereokit_refiners.runtimes.torch import Module, compose
+    from stereokit_refiners.runtimes.torch import Module
 
+    rule = NETWORKS[name].outputs["residual"]
     module = Module(NETWORKS[name], torch.Generator().manual_seed(0)).train()
     inputs = {key: torch.from_numpy(a)[None] for key, a in encoded_of(name, 16, 16).items()}
     heads = module(inputs)
     values = torch.rand(1, 2, 16, 16) * 30
-    loss = compose(name, "residual", heads["map"], inputs["disparity"] * 10 + 20, values).square().mean()
+    loss = rule.tensor_map(heads["map"], inputs["disparity"] * 10 + 20, values).square().mean()
     if "log_sigma" in heads:
         loss = loss + heads["log_sigma"].square().mean()
     loss.backward()

@@ -7,14 +7,13 @@ import pickle
 import cv2
 import numpy as np
 import pytest
-from refining import LEARNED, NAMES, needs_backend, one_line, random_content, weight_file
+from refining import LEARNED, NAMES, needs_backend, one_line, random_content, tuned_to_kitti, weight_file
 from typer.testing import CliRunner
 
 import stereokit
 from stereokit.cli.app import app
-from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit.errors import OptionError, StereokitError
 from stereokit_refiners.learned import LearnedRefiner
-from stereokit_refiners.weights import shipped
 
 pytestmark = needs_backend
 
@@ -92,14 +91,9 @@ def test_a_matcher_gives_the_confidence_and_keeps_it_back_unless_asked(pair, tmp
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_refiners_by_name(pair, name):
-    try:
-        shipped(name)
-    except FileError as error:
-        with pytest.raises(FileError, match=rf"^no weights for '{name}' come with this version$"):
-            matcher(refiner=name)
-        pytest.skip(str(error))
-    result = matcher(refiner=name)(*pair)
+def test_refiners_by_name_with_a_collection_of_weights(pair, name):
+    tuned_to_kitti(name)
+    result = matcher(refiner=name, weights="kitti")(*pair)
     assert result.disparity.shape == pair[0].shape
     assert np.isfinite(result.disparity).all()
 

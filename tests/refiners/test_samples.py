@@ -144,7 +144,7 @@ def test_the_coarse_map_of_a_variant_still_fits_its_truth(pair):
 
 
 def test_every_other_variant_is_of_the_mirrored_pair_and_all_but_0_are_changed_before_matching(pair, monkeypatch):
-    steps, calls = ("mirrored", "moved_objects", "rescaled", "photographed"), []
+    steps, calls = ("mirrored", "copy_paste", "rescaled", "photographed"), []
 
     def spied(name):
         real = getattr(samples, name)

@@ -6,13 +6,23 @@ import warnings
 
 import numpy as np
 import pytest
-from refining import LEARNED, NAMES, coarse_of, encoded_of, image_of, needs_backend, random_arrays, random_content
+from refining import (
+    LEARNED,
+    NAMES,
+    coarse_of,
+    encoded_of,
+    image_of,
+    needs_backend,
+    random_arrays,
+    random_content,
+    tuned_to_kitti,
+)
 
-from stereokit.errors import FileError, StereokitError
+from stereokit.errors import StereokitError
 from stereokit_refiners import learned
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.runtimes import reference
-from stereokit_refiners.weights import NETWORKS, shipped
+from stereokit_refiners.weights import NETWORKS
 
 pytestmark = needs_backend
 
@@ -61,11 +71,8 @@ def test_plain_numpy_is_torchs_network(name):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16", "int8"])
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_networks_pass_with_room(name, precision):
-    try:
-        content = shipped(name)
-    except FileError as error:
-        pytest.skip(str(error))
+def test_networks_tuned_to_kitti_pass_with_room(name, precision):
+    content = tuned_to_kitti(name)
     for backend in LEARNED if precision == "fp32" else {"openvino"} & set(LEARNED):
         run = learned._compile(content, backend, precision, *reference.input_size(content), 1)
         assert reference.mistake(content, run) < reference.TOLERANCES_PX[precision] / 2

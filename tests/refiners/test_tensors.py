@@ -30,10 +30,10 @@ def device(request):
 
 @pytest.mark.parametrize("size", [(32, 48), (33, 47), (1, 1), (1, 9), (2, 3)])
 @pytest.mark.parametrize(
-    ("name", "form"), [(name, "residual") for name in NAMES] + [("stereovae", "literal"), ("cnn", "literal")]
+    ("name", "mode"), [(name, "residual") for name in NAMES] + [("stereovae", "direct"), ("cnn", "direct")]
 )
-def test_tensors_give_what_arrays_give(name, form, size, device):
-    content, coarse, left = random_content(name, form=form), coarse_of(size), image_of(size)
+def test_tensors_give_what_arrays_give(name, mode, size, device):
+    content, coarse, left = random_content(name, output_mode=mode), coarse_of(size), image_of(size)
     expected = LearnedRefiner.of(content, backend="torch")(coarse, left).disparity
     refiner = TensorRefiner(content, device)
     given = [
@@ -64,10 +64,10 @@ def test_only_networks_that_look_at_the_confidence_and_candidates_need_them():
         given = refiner(coarse.disparity, coarse.confidence, left)
         assert torch.equal(refiner(coarse.disparity, None, left), given)
         assert torch.equal(refiner(coarse.disparity, None, left, coarse.candidates), given)
-    refiner = TensorRefiner(random_content("stereokit"), "cpu")
-    with pytest.raises(InputError, match=r"^confidence must be given for refiner 'stereokit', got None$"):
+    refiner = TensorRefiner(random_content("pyramid"), "cpu")
+    with pytest.raises(InputError, match=r"^confidence must be given for refiner 'pyramid', got None$"):
         refiner(coarse.disparity, None, left, coarse.candidates)
-    with pytest.raises(InputError, match=r"^candidates must be given for refiner 'stereokit', got None$"):
+    with pytest.raises(InputError, match=r"^candidates must be given for refiner 'pyramid', got None$"):
         refiner(coarse.disparity, coarse.confidence, left)
     rule = r"^candidates must be two maps of the shape of coarse \(8, 12\), got \(1, 8, 12\)$"
     with pytest.raises(InputError, match=rule):

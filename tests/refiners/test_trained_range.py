@@ -8,12 +8,13 @@ import warnings
 import cv2
 import numpy as np
 import pytest
-from refining import NAMES, coarse_of, image_of, needs_backend, random_content, sure
+from refining import NAMES, coarse_of, image_of, needs_backend, random_content, sure, tuned_to_kitti
 
 import stereokit
 from stereokit import Matcher
 from stereokit.errors import StereokitWarning
 from stereokit_refiners.learned import LearnedRefiner
+from stereokit_refiners.linear import Linear
 from stereokit_refiners.runtimes.encode import BEGINNING, base_of
 
 pytestmark = needs_backend
@@ -59,7 +60,7 @@ def coarse_maps():
 @pytest.mark.parametrize("name", ["linear", *NAMES])
 def test_an_offset_of_all_disparities_hardly_changes_the_error(coarse_maps, name):
     truth, maps = coarse_maps
-    refiner = stereokit.REFINERS.get(name)(**({} if name == "linear" else {"precision": "fp32"}))
+    refiner = Linear() if name == "linear" else LearnedRefiner.of(tuned_to_kitti(name), precision="fp32")
     errors = {offset: (refiner(*maps[offset]).disparity - truth - offset)[:, offset + 60 :] for offset in OFFSETS}
     medians = {offset: float(np.median(error)) for offset, error in errors.items()}
     wrong = {offset: np.mean(np.abs(error) > 2) for offset, error in errors.items()}
@@ -104,7 +105,9 @@ def test_tensors_are_lowered_as_arrays_are(name, offset):
 def test_blank_images_stay_inside_the_range(name, low, high):
     blank = np.full((64, 96), 255, np.uint8)
     noise = np.random.default_rng(5).integers(0, 256, blank.shape, np.uint8)
-    matcher = Matcher("S2", min_disparity=low, max_disparity=high, scale=0.5, refiner=name)
+    matcher = Matcher(
+        "S2", min_disparity=low, max_disparity=high, scale=0.5, refiner=LearnedRefiner.of(tuned_to_kitti(name))
+    )
     for left, right in ((blank, blank), (blank // 2, blank), (noise, blank)):
         disparity = matcher(left, right).disparity
         assert low <= disparity.min() and disparity.max() <= high
@@ -114,7 +117,7 @@ def test_blank_images_stay_inside_the_range(name, low, high):
 def test_nothing_lies_beyond_what_the_matcher_has_found(name):
     coarse, left = coarse_of((34, 50)), image_of((34, 50))
     fine = LearnedRefiner.of(random_content(name, last=50.0), precision="fp32")(coarse, left)
-    maps = [coarse.disparity, coarse.candidates] if name == "stereokit" else [coarse.disparity]
+    maps = [coarse.disparity, coarse.candidates] if name == "pyramid" else [coarse.disparity]
     low, high = 2 * float(min(one.min() for one in maps)), 2 * float(max(one.max() for one in maps))
     assert fine.disparity.min() >= low - 1e-4 and fine.disparity.max() <= high + 1e-4
     assert (fine.disparity == np.float32(low)).any() or (fine.disparity == np.float32(high)).any()

@@ -82,7 +82,7 @@ def test_the_papers_recipe():
     assert paper.batch == 1
     assert paper.betas == (0.99, 0.999)
     assert paper.learning_rate == 5e-4
-    assert (paper.form, paper.loss, paper.finish, paper.divergence) == ("literal", "l1", None, 256)
+    assert (paper.output_mode, paper.loss, paper.finish, paper.divergence) == ("direct", "l1", None, 256)
     assert (paper.decay, paper.clip, paper.ema, paper.patience) == (0, 0, 0, 0)
     for step, times in ((0, 0), (1599, 0), (1600, 1), (3200, 2), (159_999, 99)):
         assert loop._rate(paper, step) == pytest.approx(5e-4 * 0.97**times)
@@ -101,7 +101,7 @@ def test_the_default_schedule_warms_up_and_ends_near_nothing():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"form": "printed"}, "form must be one of residual, literal, got 'printed'"),
+        ({"output_mode": "printed"}, "output_mode must be one of residual, direct, got 'printed'"),
         ({"loss": "l2"}, "loss must be one of l1, bounded, d1, got 'l2'"),
         ({"finish": "l2"}, "loss must be one of l1, bounded, d1, got 'l2'"),
         ({"schedule": "step"}, "schedule must be cosine or paper, got 'step'"),
@@ -170,15 +170,15 @@ def test_exactly_3_pixels_and_exactly_5_percent_are_good():
 
 
 @pytest.mark.parametrize("size", [(24, 40), (23, 37)])
-@pytest.mark.parametrize(("name", "form"), [(n, "residual") for n in NAMES] + [("stereovae", "literal")])
-def test_predict_is_what_the_refiner_computes(name, form, size):
+@pytest.mark.parametrize(("name", "mode"), [(n, "residual") for n in NAMES] + [("stereovae", "direct")])
+def test_predict_is_what_the_refiner_computes(name, mode, size):
     pytest.importorskip("safetensors")
     arrays, sample = random_arrays(name, 1), sample_of(1, size)
     module = loop.restored(NETWORKS[name], arrays)
-    found = predict(module, form, sample)
+    found = predict(module, mode, sample)
     assert found.shape == size
     assert found.dtype == np.float32
-    refiner = LearnedRefiner.of(WeightFile(name, form, arrays), backend="torch")
+    refiner = LearnedRefiner.of(WeightFile(name, mode, arrays), backend="torch")
     coarse = coarse_map(sample)
     image = np.ascontiguousarray(sample.left[: size[0], : size[1]])
     np.testing.assert_allclose(found, refiner(coarse, image).disparity, rtol=0, atol=2e-3)
@@ -193,14 +193,14 @@ def test_predict_leaves_the_module_as_it_was():
 
 def test_the_score_is_pooled_not_averaged(monkeypatch):
     small, large = sample_of(1, (8, 8)), sample_of(2, (24, 40))
-    monkeypatch.setattr(loop, "predict", lambda module, form, sample, half: sample)
+    monkeypatch.setattr(loop, "predict", lambda module, output_mode, sample, half: sample)
     monkeypatch.setattr(loop, "bad_pixels", lambda estimate, sample: (6, 8) if sample is small else (10, 92))
     assert loop._score(None, settings(), [small, large]) == pytest.approx(16.0)
     assert loop._score(None, settings(), []) is None
 
 
 def test_batches_are_functions_of_seed_step_and_rank():
-    network, chosen = NETWORKS["stereokit"], settings(batch=2)
+    network, chosen = NETWORKS["pyramid"], settings(batch=2)
 
     def draw(step, rank=0, seed=3):
         return loop._draw(network, SOURCES, dataclasses.replace(chosen, seed=seed), step, rank)
@@ -493,8 +493,8 @@ def test_calibration_after_training_gives_int8():
 
 def test_a_form_that_the_network_lacks_is_refused():
     """The pyramid's head has 57 channels: it has no literal form."""
-    with pytest.raises(StereokitError, match="literal"):
-        fit(NETWORKS["stereokit"], SOURCES, [], settings(form="literal"))
+    with pytest.raises(StereokitError, match="direct"):
+        fit(NETWORKS["pyramid"], SOURCES, [], settings(output_mode="direct"))
 
 
 RANKS = """

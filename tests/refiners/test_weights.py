@@ -8,15 +8,16 @@ import pickle
 
 import numpy as np
 import pytest
-from refining import NAMES, one_line, random_arrays, random_content
+from refining import NAMES, one_line, random_arrays, random_content, tuned_to_kitti
 
 import stereokit
-from stereokit.errors import FileError, StereokitError
-from stereokit_refiners.weights import NETWORKS, WeightFile, network_named, read, shipped, write
+from stereokit.errors import FileError, OptionError, StereokitError
+from stereokit_refiners import weights
+from stereokit_refiners.weights import NETWORKS, WeightFile, collection_file, find, network_named, read, shipped, write
 
 safetensors_numpy = pytest.importorskip("safetensors.numpy")
 
-METADATA = {"format": "stereokit-refiner/2", "network": "cnn", "form": "residual", "ranges": "{}", "notes": "{}"}
+METADATA = {"format": "stereokit-refiner/2", "network": "cnn", "output_mode": "residual", "ranges": "{}", "notes": "{}"}
 
 
 def raw(path, arrays=None, **metadata):
@@ -42,7 +43,7 @@ def test_what_is_written_is_read(name, tmp_path):
     path = tmp_path / "w.safetensors"
     write(path, content)
     found = read(path)
-    assert (found.network, found.form) == (name, "residual")
+    assert (found.network, found.output_mode) == (name, "residual")
     assert found.ranges == ranges
     assert found.notes == {"seed": 3, "words": ["a", None]}
     assert set(found.arrays) == set(content.arrays)
@@ -102,10 +103,11 @@ def test_loading_never_runs_code(tmp_path):
     [
         ({"format": "stereokit-refiner/3"}, ["stereokit-refiner/2", "stereokit-refiner/3"]),
         ({"format": ""}, ["format"]),
-        ({"network": "resnet"}, ["no network named 'resnet'", "cnn, evidence, stereokit, stereovae"]),
+        ({"network": "resnet"}, ["no network named 'resnet'", "cnn, evidence, pyramid, stereovae"]),
         ({"network": ""}, ["no network named ''"]),
         ({"network": "stereovae"}, ["weights must be those of 'stereovae'", "lacks 'D_1.bias'"]),
-        ({"form": "printed"}, ["must be one of residual, literal", "'printed'"]),
+        ({"output_mode": "printed"}, ["must be one of residual, direct", "'printed'"]),
+        ({"output_mode": ""}, ["must be one of residual, direct", "''"]),
         ({"ranges": "not json"}, ["ranges and notes as JSON"]),
         ({"ranges": "[1, 2]"}, ["ranges and notes as JSON"]),
         ({"ranges": '{"FE_1": "wide"}'}, ["ranges and notes as JSON"]),
@@ -183,16 +185,16 @@ def test_nothing_wrong_is_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_form_that_does_not_exist_is_not_written(tmp_path):
-    with pytest.raises(StereokitError, match="form"):
+def test_an_output_mode_that_does_not_exist_is_not_written(tmp_path):
+    with pytest.raises(StereokitError, match="output_mode"):
         write(tmp_path / "w.safetensors", WeightFile("cnn", "printed", random_arrays("cnn")))
     assert not list(tmp_path.iterdir())
 
 
-def test_the_pyramid_has_no_literal_form(tmp_path):
-    """Its head has 57 channels, of which the literal rule would take the first four for the map."""
-    with pytest.raises(StereokitError, match="literal"):
-        write(tmp_path / "w.safetensors", random_content("stereokit", form="literal"))
+def test_the_pyramid_has_no_direct_mode(tmp_path):
+    """Its head has 65 channels, of which the direct rule would take the first four for the map."""
+    with pytest.raises(StereokitError, match="direct"):
+        write(tmp_path / "w.safetensors", random_content("pyramid", output_mode="direct"))
 
 
 def test_a_file_that_stands_stays_when_writing_fails(tmp_path):
@@ -204,28 +206,60 @@ def test_a_file_that_stands_stays_when_writing_fails(tmp_path):
     assert path.read_bytes() == kept
 
 
-def test_without_safetensors_the_extra_is_named(monkeypatch, tmp_path):
-    import sys
-
-    monkeypatch.setitem(sys.modules, "safetensors", None)
-    with pytest.raises(StereokitError, match=r"need safetensors, which is not installed: .*stereokit\[refiners\]'$"):
-        read(tmp_path / "w.safetensors")
+def test_files_that_call_the_output_mode_a_form_are_read(tmp_path):
+    for form, mode in (("residual", "residual"), ("literal", "direct")):
+        path = tmp_path / f"{form}.safetensors"
+        metadata = {k: v for k, v in METADATA.items() if k != "output_mode"}
+        path.write_bytes(safetensors_numpy.save(random_arrays("cnn"), metadata={**metadata, "form": form}))
+        assert read(path).output_mode == mode
 
 
 def test_architectures_by_name():
-    assert list(NETWORKS) == ["stereovae", "cnn", "stereokit", "evidence"]
+    assert list(NETWORKS) == ["stereovae", "cnn", "pyramid", "evidence"]
     assert network_named("cnn") is NETWORKS["cnn"]
     with pytest.raises(FileError, match=r"^no network named 'stereovea'; did you mean 'stereovae'\?"):
         network_named("stereovea")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_weights(name):
-    try:
-        content = shipped(name)
-    except FileError as error:
-        assert one_line(error) == f"no weights for {name!r} come with this version"
-        pytest.skip(str(error))
+def test_networks_that_come_without_weights_say_where_there_are_some(name):
+    with pytest.raises(FileError) as caught:
+        find(name, None)
+    line = one_line(caught.value)
+    for part in (
+        f"refiner {name!r} needs weights",
+        "pip install ./refiners/kitti",
+        f"stereokit train --refiner {name}",
+    ):
+        assert part in line
+
+
+def test_collections_are_found_by_name(tmp_path, monkeypatch):
+    content = tuned_to_kitti("cnn")
+    assert content.fingerprint == read(collection_file("kitti", "cnn")).fingerprint
+    with pytest.raises(FileError, match=r"^weights 'kitti' are of cnn, pyramid, stereovae, got refiner 'evidence'$"):
+        find("evidence", "kitti")
+    with pytest.raises(FileError, match=r"^weights 'kitti' are of cnn, pyramid, stereovae, got refiner 'file'$"):
+        find("", "kitti")
+    with pytest.raises(FileError, match=r"^no weights named 'kity'; did you mean 'kitti'\?"):
+        find("cnn", "kity")
+    write(tmp_path / "kitti", content)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OptionError, match="must be its own"):  # the file of that name, in the folder at hand
+        find("stereovae", "kitti")
+
+
+def test_a_collection_that_is_not_installed_says_how_to_install_it_and_under_which_terms(monkeypatch):
+    monkeypatch.setattr(weights, "entry_points", lambda group: ())
+    with pytest.raises(FileError) as caught:
+        find("cnn", "kitti")
+    line = one_line(caught.value)
+    assert "CC BY-NC-SA 3.0" in line and "pip install ./refiners/kitti" in line
+
+
+@pytest.mark.parametrize("name", ["evidence", *NAMES])
+def test_weights_that_are_published(name):
+    content = shipped(name) if name == "evidence" else tuned_to_kitti(name)
     assert content.network == name
     assert content.ranges, "int8 needs them"
     assert content.notes
@@ -236,8 +270,6 @@ def test_shipped_weights_are_small():
     from importlib.resources import files
 
     folder = files("stereokit_refiners") / "weights"
-    if not folder.is_dir():
-        pytest.skip("no weights come with this version")
     for path in folder.iterdir():
         if path.name.endswith(".safetensors"):
             assert len(path.read_bytes()) < 1_000_000

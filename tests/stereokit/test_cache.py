@@ -27,9 +27,9 @@ USE = """
         import numpy as np
         import stereokit
         from stereokit.postprocess.fill import fill
-        from stereokit_refiners.runtimes.compose import compose
+        from stereokit_refiners.outputs import Direct
         filled = fill(np.array([[np.nan, 3, np.nan]], np.float32))
-        full = compose("cnn", "literal", np.full((1, 1, 4), 0.5, np.float32), None, 2, 2, 1)
+        full = Direct().map(np.full((1, 1, 4), 0.5, np.float32), np.zeros((1, 1), np.float32), 2, 2)
     assert filled.tolist() == [[3, 3, 3]] and full.tolist() == [[128, 128]] * 2
     print(stereokit.__file__, [str(w.message) for w in caught if w.category is RuntimeWarning], sep="\\n")
     """

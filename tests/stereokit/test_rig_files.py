@@ -131,9 +131,9 @@ K1: !!opencv-matrix
 D1: [ -0.28, 1e-1, 1e-3, -8e-4, 2e-2 ]
 K2: [[698.5, 0, 318], [0, 699.25, 242.5], [0, 0, 1]]
 D2: [ -.26, 9.0E-2, -6E-4, 0.0011, -1.5e-2 ]
-R: [%s]
+R: [{}]
 T: [ -1.2e-1, 1.e-3, -2e-3 ]
-""" % ", ".join(map(repr, map(float, R.ravel())))
+""".format(", ".join(map(repr, map(float, R.ravel()))))
     for change in (
         lambda b: b"%YAML:1.0\n" + b,
         lambda b: b"\xef\xbb\xbf" + b,

@@ -28,6 +28,7 @@ from stereokit.cli.options import (
     RefinerOption,
     ScaleOption,
     SettingsOption,
+    WeightsOption,
     check_fits_png,
     check_json,
     parse_settings,
@@ -46,7 +47,7 @@ from stereokit_evaluation.common.progress import progress
 
 __all__ = ["batch", "find_pairs"]
 
-_OWN_OPTIONS = frozenset("method max_disparity min_disparity scale refiner fill device threads".split())
+_OWN_OPTIONS = frozenset("method max_disparity min_disparity scale refiner weights fill device threads".split())
 _FORMATS = tuple(suffix[1:] for suffix in DISPARITY_SUFFIXES)
 _SHOWN_ERRORS = 10
 
@@ -59,6 +60,7 @@ def batch(
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,
     refiner: RefinerOption = None,
+    weights: WeightsOption = None,
     fill: FillOption = None,
     device: DeviceOption = "auto",
     settings: SettingsOption = None,
@@ -86,7 +88,7 @@ def batch(
     if file_format == "png":
         check_fits_png("--format png", min_disparity, max_disparity)
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
-    given = {"refiner": refiner, "fill": fill}
+    given = {"refiner": refiner, "weights": weights, "fill": fill}
     options.update({name: value for name, value in given.items() if value is not None})
     options["device"] = device
     options.update(parse_settings(settings or (), _OWN_OPTIONS))
@@ -95,6 +97,8 @@ def batch(
             raise OptionError(f"{name} is not written by batch, only the map of the left view is")
     if refiner is not None and refiner.endswith(".safetensors"):
         options["refiner"] = os.path.abspath(refiner)
+    if weights is not None and weights.endswith(".safetensors"):
+        options["weights"] = os.path.abspath(weights)
     where = os.path.abspath(output)
     job = Job(where, f".{file_format}", color, method, tuple(sorted(options.items())))
     matcher_of(job)  # refuses what cannot be

@@ -20,7 +20,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from stereokit.cli.options import JsonOption, check_json, write_json
+from stereokit.cli.options import JsonOption, WeightsOption, check_json, write_json
 from stereokit.cuda.driver import describe
 from stereokit.defaults import METHODS
 from stereokit.errors import InputError, OptionError
@@ -42,7 +42,7 @@ from stereokit_evaluation.study.configurations import settings_at_hand
 from stereokit_evaluation.study.table2 import PipelineRow, print_pipeline, time_pipeline
 from stereokit_evaluation.study.table2 import as_json as pipeline_json
 from stereokit_evaluation.synthetic.scenes import generate
-from stereokit_refiners.weights import NETWORKS
+from stereokit_refiners.learned import learned_names
 
 __all__ = ["bench"]
 
@@ -72,6 +72,7 @@ def bench(
     runtimes: Annotated[
         str | None, typer.Option(help="With --pipeline: this refiner in every runtime and precision too.")
     ] = None,
+    weights: WeightsOption = None,
     device: Annotated[str, typer.Option(help="cpu, or cuda: our methods on the GPU, OpenCV beside them.")] = "cpu",
     model: Annotated[
         bool, typer.Option("--model", help="No times but modelled ones: our methods on four GPUs; needs none.")
@@ -101,14 +102,14 @@ def bench(
     if rounds < 1:
         raise OptionError(f"rounds must be at least 1, got {rounds}")
     check_json(json_file)
-    _check_tables(model, device, pipeline, stages, scale, runtimes)
+    _check_tables(model, device, pipeline, stages, scale, runtimes, weights)
     if (left is None) != (right is None):
         raise OptionError("left and right go together, got only one of them")
     pictures = None if left is None or right is None else (_read(left), _read(right))
     if pictures is not None and pictures[0].shape != pictures[1].shape:
         raise InputError(f"left and right must have the same size, got {pictures[0].shape} and {pictures[1].shape}")
     if pipeline:
-        return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, runtimes, json_file)
+        return _pipeline(chosen, counts, method or ["S4"], rounds, pictures, with_peers, runtimes, weights, json_file)
     methods = list(dict.fromkeys(parse_method(name) for name in method or METHODS))
     if model:
         if pictures is not None:
@@ -158,7 +159,9 @@ def bench(
         raise typer.Exit(130)
 
 
-def _check_tables(model: bool, device: str, pipeline: bool, stages: bool, scale: float, runtimes: str | None) -> None:
+def _check_tables(
+    model: bool, device: str, pipeline: bool, stages: bool, scale: float, runtimes: str | None, weights: str | None
+) -> None:
     """Refuse options that do not go together."""
     if device not in ("cpu", "cuda"):
         raise OptionError(f"device must be 'cpu' or 'cuda', got {device!r}")
@@ -170,10 +173,12 @@ def _check_tables(model: bool, device: str, pipeline: bool, stages: bool, scale:
         raise OptionError(f"scale must be 1 or 0.5, got {scale:g}")
     if scale != 1 and not (model or device == "cuda"):
         raise OptionError(f"scale must come with model or device cuda, got {scale:g} alone; see also pipeline")
+    if weights is not None and not pipeline:
+        raise OptionError(f"weights must come with pipeline, got {weights!r} alone")
     if runtimes is not None and not pipeline:
         raise OptionError(f"runtimes must come with pipeline, got {runtimes!r} alone")
-    if runtimes is not None and runtimes not in NETWORKS:
-        raise OptionError(f"runtimes must be one of {', '.join(NETWORKS)}, got {runtimes!r}")
+    if runtimes is not None and runtimes not in learned_names():
+        raise OptionError(f"runtimes must be one of {', '.join(learned_names())}, got {runtimes!r}")
 
 
 def _pipeline(
@@ -184,6 +189,7 @@ def _pipeline(
     pictures: tuple[Gray, Gray] | None,
     with_peers: bool,
     runtimes: str | None,
+    weights: str | None,
     json_file: Path | None,
 ) -> None:
     """Time table II of the paper, print it and write it."""
@@ -197,7 +203,16 @@ def _pipeline(
                 images = _images(size, pictures)
                 for count in counts:
                     time_pipeline(
-                        size, count, methods, images, rounds, rows, with_peers=with_peers, runtimes=runtimes, step=step
+                        size,
+                        count,
+                        methods,
+                        images,
+                        rounds,
+                        rows,
+                        with_peers=with_peers,
+                        runtimes=runtimes,
+                        weights=weights,
+                        step=step,
                     )
         except KeyboardInterrupt:
             interrupted = True

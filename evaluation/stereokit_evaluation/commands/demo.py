@@ -37,7 +37,7 @@ from stereokit_evaluation.synthetic.scenes import Scene, generate
 __all__ = ["Panel", "demo", "overview"]
 
 _RUNS = 3
-_REFINER = "stereovae"
+_REFINER = "stereokit"
 _CAPTION_PX, _GAP_PX = 26, 6
 _PAPER, _INK = (250, 250, 250), (32, 32, 36)
 

@@ -18,12 +18,13 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 
 from stereokit import __version__
-from stereokit.cli.options import DeviceOption, JsonOption, check_json, parse_settings, write_json
+from stereokit.cli.options import DeviceOption, JsonOption, WeightsOption, check_json, parse_settings, write_json
 from stereokit.cli.output import Table
 from stereokit.errors import OptionError, one_line
 from stereokit.io import write_image
 from stereokit_evaluation.common.folders import make_folder
 from stereokit_evaluation.common.progress import progress
+from stereokit_evaluation.common.weights import check_weights, weights_option
 from stereokit_evaluation.data.datasets import load, select
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.error_map import error_map
@@ -45,7 +46,7 @@ __all__ = ["Result", "evaluate", "run"]
 
 _DEFAULT_METHOD = "census+sgm"
 _DEFAULT_DISPARITIES = 128
-_OWN_OPTIONS = frozenset(("method", "scale", "refiner", "device", "threads", "max_disparity"))
+_OWN_OPTIONS = frozenset(("method", "scale", "refiner", "weights", "device", "threads", "max_disparity"))
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ def evaluate(
     method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,
     scale: Annotated[float, typer.Option(help="1, or 0.5 to match at half size.")] = 1.0,
     refiner: Annotated[list[str] | None, typer.Option(help="Refiner for the half-size map; may repeat.")] = None,
+    weights: WeightsOption = None,
     predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")] = None,
@@ -90,7 +92,13 @@ def evaluate(
     chosen = select(load(dataset, root, count=count), frames)
     options: dict[str, Any]
     if predictions is not None:
-        given: dict[str, Any] = {"method": method, "refiner": refiner, "set": settings, "threads": threads}
+        given: dict[str, Any] = {
+            "method": method,
+            "refiner": refiner,
+            "weights": weights,
+            "set": settings,
+            "threads": threads,
+        }
         given |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
         for name in (name for name, value in given.items() if value is not None and value != []):
             raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")
@@ -102,8 +110,9 @@ def evaluate(
             max_disparity = max(suggested, default=_DEFAULT_DISPARITIES)
         options = {"max_disparity": max_disparity, "threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
         methods = method or [_DEFAULT_METHOD]
+        check_weights(refiner or (), weights)
         runs = [
-            _matcher_run(name, scale, refine, device, options, color)
+            _matcher_run(name, scale, refine, device, options | weights_option(refine, weights), color)
             for name in methods
             for refine in (dict.fromkeys(refiner) if refiner else (None,))
         ]
@@ -115,7 +124,7 @@ def evaluate(
     document = {
         "results": [_as_json(job, result) for job, result in zip(runs, results, strict=False)],
         "dataset": dataset,
-        "options": {**options, "color": color, "frames": frames},
+        "options": {**options, "weights": weights, "color": color, "frames": frames},
         "skipped": [{"frame": skip.name, "reason": skip.reason} for skip in skipped],
         "interrupted": interrupted,
         "version": __version__,

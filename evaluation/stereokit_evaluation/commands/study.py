@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from stereokit import METHODS, __version__
-from stereokit.cli.options import DeviceOption, JsonOption, check_json, parse_settings, write_json
+from stereokit.cli.options import DeviceOption, JsonOption, WeightsOption, check_json, parse_settings, write_json
 from stereokit.errors import OptionError
 from stereokit.io import check_output
 from stereokit.kernels.threads import available_threads
@@ -55,6 +55,7 @@ def study(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage; may repeat.")
     ] = None,
+    weights: WeightsOption = None,
     max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
     count: Annotated[int, typer.Option(help="Number of synthetic scenes.")] = 20,
     threads: Annotated[int | None, typer.Option(help="Threads of the matchers.")] = None,
@@ -88,6 +89,7 @@ def study(
     suggested = max((f.max_disparity for f in chosen if f.max_disparity is not None), default=_DEFAULT_DISPARITIES)
     levels = suggested if max_disparity is None else max_disparity
     options = {"max_disparity": levels, "threads": threads, "device": device, **parse_settings(settings or ())}
+    options |= {} if weights is None else {"weights": weights}
     methods, wanted = method or list(METHODS), [parse_setting(name) for name in setting or settings_at_hand()]
     if train_settings and not train:
         raise OptionError(f"train-set must go with train, got {train_settings[0]!r} alone")

@@ -25,7 +25,7 @@ __all__ = ["train"]
 
 def train(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the result; made if missing.")],
-    refiner: Annotated[str, typer.Option(help="Architecture: stereovae, cnn or stereokit.")] = "stereovae",
+    refiner: Annotated[str, typer.Option(help="Architecture: stereovae, cnn or pyramid.")] = "stereovae",
     dataset: Annotated[str | None, typer.Option(help="kitti2015, kitti2012, middlebury, folder ...")] = None,
     root: Annotated[Path | None, typer.Option(help="Folder of the data set.")] = None,
     frames: Annotated[str | None, typer.Option(help="Frames to train on, such as 13-33,46.")] = None,

@@ -18,12 +18,14 @@ from stereokit.cli.options import (
     MaxDisparityOption,
     MinDisparityOption,
     ScaleOption,
+    WeightsOption,
     check_json,
     parse_settings,
     write_json,
 )
 from stereokit.errors import InputError, OptionError
 from stereokit.io import check_output, read_disparity, read_pair, write_bytes
+from stereokit_evaluation.common.weights import check_weights, weights_option
 from stereokit_evaluation.report import viewer
 from stereokit_evaluation.report.page import render, require
 from stereokit_evaluation.scoring.kitti import score
@@ -41,6 +43,7 @@ def view(
     min_disparity: MinDisparityOption = 0,
     scale: ScaleOption = 1.0,
     refiner: Annotated[list[str] | None, typer.Option(help="For --scale 0.5; may repeat.")] = None,
+    weights: WeightsOption = None,
     threads: Annotated[int | None, typer.Option(help="Threads; all processors by default.")] = None,
     device: DeviceOption = "auto",
     settings: Annotated[
@@ -66,9 +69,12 @@ def view(
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
     options |= {"threads": threads, "device": device, **parse_settings(settings or ())}
     names = list(dict.fromkeys(method or ["S2"]))
+    check_weights(refiner or (), weights)
     refiners: list[str | None] = [*refiner] if refiner else [None]
     matchers = {
-        f"{name} {title(refine or 'linear') if scale != 1 else ''}".strip(): Matcher(name, refiner=refine, **options)
+        f"{name} {title(refine or 'linear') if scale != 1 else ''}".strip(): Matcher(
+            name, refiner=refine, **options, **weights_option(refine, weights)
+        )
         for name in names
         for refine in refiners
     }

@@ -26,6 +26,7 @@ from stereokit.matching import METHODS, Matcher
 from stereokit.methods import find_refiner, option_names, parse_method
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit_evaluation.bench import peers
+from stereokit_evaluation.common.weights import needs_weights
 from stereokit_evaluation.scoring.runner import Matching
 
 __all__ = [
@@ -46,7 +47,7 @@ PAPER_SETTINGS = {"linear": "Mini+Linear", "original": "Original", "cnn": "Mini+
 PEER = "peer"
 """The setting of another library's matcher."""
 
-_NO_SETTINGS = ("file",)  # the registry's name for a weight file, which is a setting by its path
+_NO_SETTINGS = ("auto", "file", "general")  # choose among others, take a path, are another's second name
 
 Trained = Mapping[tuple[str, str], Any]
 """Method and setting to what `stereokit.Matcher` takes as its refiner: a weight file, or a refiner."""
@@ -151,9 +152,12 @@ def build(
             raise OptionError(f"option {option!r} must belong to a chosen method, got {', '.join(names)}")
     learned = {setting: _refiner_options(setting) for setting in settings}
     everywhere = {option for names_ in learned.values() for option in names_}
+    without_weights = {setting for setting in settings if learned[setting] and needs_weights(setting)}
 
     def fitting(name: str, setting: str) -> dict[str, Any]:
         left_out = _foreign(name) | everywhere - learned[setting]
+        if setting not in without_weights or (name, setting) in (trained or {}):
+            left_out |= {"weights"}
         return {option: value for option, value in options.items() if option not in left_out}
 
     return [

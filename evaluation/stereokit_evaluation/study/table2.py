@@ -80,6 +80,7 @@ def time_pipeline(
     *,
     with_peers: bool = True,
     runtimes: str | None = None,
+    weights: str | None = None,
     step: Callable[[str], None] = lambda text: None,
 ) -> None:
     """Time the rows of one size and number of threads; they are appended to `rows` before the first run.
@@ -99,10 +100,13 @@ def time_pipeline(
         OpenCV's 3WAY and HH too.
     runtimes : str or None
         A refiner that is timed in each runtime and precision too.
+    weights : str or None
+        Of the refiners that come without.
     step : callable
         Called with a few words after each call.
     """
-    options = {"max_disparity": size.levels, "threads": threads}
+    options: dict[str, Any] = {"max_disparity": size.levels, "threads": threads}
+    options |= {} if weights is None else {"weights": weights}
     calls: dict[str, Callable[[], object]] = {}
     times: dict[str, list[float]] = {}
     with opencv_threads(threads):

@@ -74,9 +74,9 @@ def run_training(
         If an option breaks its rule, frames have no ground truth, files cannot be used, or torch is not installed.
     """
     torch = _torch()
-    from stereokit_refiners.runtimes.encode import check_form
+    from stereokit_refiners.networks.layers import output_rule
     from stereokit_refiners.training.loop import Source
-    from stereokit_refiners.training.samples import Shelf, store_variant
+    from stereokit_refiners.training.samples import SampleFiles, store_variant
     from stereokit_refiners.weights import NETWORKS, read
 
     chosen = _settings(preset, settings)
@@ -98,7 +98,7 @@ def run_training(
     for name in methods:
         parse_method(name)
     check_levels(0, max_disparity)
-    check_form(chosen.form, NETWORKS[refiner].forms, refiner)
+    output_rule(NETWORKS[refiner], chosen.output_mode)
     everything = [] if dataset is None else list(load(dataset, root))
     groups = _groups(everything, frames, validation, folds)
     more = _extra(extra)
@@ -113,27 +113,27 @@ def run_training(
     if cache is not None:
         make_folder("cache", cache)
     make_folder("output", output)
-    held = output / "cache" if cache is None else cache
+    folder_of_maps = output / "cache" if cache is None else cache
     world = _join_group(torch)
 
     def stored(frame: Frame, numbers: range, step: Callable[..., None]) -> list[Path]:
         pair = pair_of(frame)
-        found = []
+        paths = []
         for name in methods:
             for number in numbers:
-                found.append(store_variant(pair, name, chosen.seed, number, max_disparity, held))
+                paths.append(store_variant(pair, name, chosen.seed, number, max_disparity, folder_of_maps))
                 step(f"{frame.name} {name}")
-        return found
+        return paths
 
     def stored_streets(step: Callable[..., None]) -> list[Path]:
-        found = []
+        paths = []
         for k in range(streets):
-            pair = scene_pair(FIRST_SEED + k, held)
+            pair = scene_pair(FIRST_SEED + k, folder_of_maps)
             for n in (0, 1):
                 name = methods[(k + 2 * n) % len(methods)]
-                found.append(store_variant(pair, name, chosen.seed, n + 1, max_disparity, held))
+                paths.append(store_variant(pair, name, chosen.seed, n + 1, max_disparity, folder_of_maps))
                 step(pair.name)
-        return found
+        return paths
 
     trained = {frame.name: frame for training, _ in groups for frame in training} | more
     tested = {frame.name: frame for _, held_out in groups for frame in held_out}
@@ -149,10 +149,10 @@ def run_training(
         of_streets = (street_share if mine or others else 1.0) if scenes else 0.0
         of_others = (extra_share if mine else 1 - of_streets) if others else 0.0
         shares = ((scenes, of_streets), (mine, 1 - of_streets - of_others), (others, of_others))
-        sources = [Source(Shelf(paths), share) for paths, share in shares if paths and share > 0]
+        sources = [Source(SampleFiles(paths), share) for paths, share in shares if paths and share > 0]
         folder = output if folds is None else output / f"fold-{number}"
         where = [(frame.name, name) for frame in held_out for name in methods]
-        looked_at = Shelf([path for frame in held_out for path in truth[frame.name]])
+        looked_at = SampleFiles([path for frame in held_out for path in truth[frame.name]])
         seen = [*(f"{dataset}/{frame.name}" for frame in training), *more]
         outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world, seen, max_disparity)
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})
@@ -170,12 +170,12 @@ def _torch() -> Any:
     return torch
 
 
-def _settings(preset: str, given: Sequence[str]) -> Any:
+def _settings(preset: str, texts: Sequence[str]) -> Any:
     from stereokit_refiners.training.loop import PRESETS, Settings
 
     if preset not in PRESETS:
         raise OptionError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
-    options = parse_settings(given, frozenset())
+    options = parse_settings(texts, frozenset())
     known = [f.name for f in fields(Settings)]
     for name in options:
         if name not in known:
@@ -202,10 +202,10 @@ def _groups(
     return [([*(f for other in parts if other is not part for f in other), *extra], part) for part in parts]
 
 
-def _extra(given: Sequence[str]) -> dict[str, Frame]:
+def _extra(texts: Sequence[str]) -> dict[str, Frame]:
     """Return the frames of further data sets by names that clash with no other."""
     frames = {}
-    for text in given:
+    for text in texts:
         dataset, colon, root = text.partition(":")
         if not colon or not root:
             raise OptionError(f"extra must be DATASET:ROOT, got {text!r}")
@@ -252,19 +252,19 @@ def _train_one(
     module = restored(network, arrays)
     counts: dict[str, list[int]] = {}
     for sample, (_, name) in zip(looked_at, where, strict=True):
-        bad, known = bad_pixels(predict(module, settings.form, sample), sample)
+        bad, known = bad_pixels(predict(module, settings.output_mode, sample), sample)
         total = counts.setdefault(name, [0, 0])
         total[0] += bad
         total[1] += known
     if world[0] == 0:
-        ranges = calibrated(module, settings.form, sources)
+        ranges = calibrated(module, settings.output_mode, sources)
         notes = {
             "disparities": [0, max_disparity],
             "frames": sorted(seen),
             "settings": asdict(settings),
             "start": None if start is None else start.fingerprint,
         }
-        write(folder / "weights.safetensors", WeightFile(refiner, settings.form, arrays, ranges, notes))
+        write(folder / "weights.safetensors", WeightFile(refiner, settings.output_mode, arrays, ranges, notes))
         write_bytes(folder / "curves.csv", history.csv())
         write_bytes(folder / "curves.png", _curves(history))
     return {"folder": str(folder), "bad_and_known": counts, "steps": history.rows[-1][0] if history.rows else 0}

@@ -24,12 +24,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from stereokit.cli.options import JsonOption, check_json, write_json
+from stereokit.cli.options import JsonOption, WeightsOption, check_json, write_json
 from stereokit.errors import FileError, OptionError, StereokitError
 from stereokit.io import write_bytes
 from stereokit.result import Disparity
 from stereokit_refiners.learned import LearnedRefiner
-from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
+from stereokit_refiners.weights import NETWORKS, WeightFile, find, read
 
 __all__ = ["TOLERANCE_PX", "export", "largest_difference", "onnx_model"]
 
@@ -41,7 +41,8 @@ _FORMATS = ("onnx", "openvino")
 
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="FILE.onnx, or FILE.xml with FILE.bin beside it.")],
-    refiner: Annotated[str, typer.Option(help="stereovae, cnn, stereokit, or a weight file.")] = "stereovae",
+    refiner: Annotated[str, typer.Option(help="stereovae, cnn, pyramid, or a weight file.")] = "stereovae",
+    weights: WeightsOption = None,
     format: Annotated[str, typer.Option(help="onnx or openvino.")] = "onnx",
     json_file: JsonOption = None,
 ) -> None:
@@ -54,7 +55,8 @@ def export(
         raise OptionError(f"output must end in {ending} for format {format!r}, got {str(output)!r}")
     if output.is_dir() or not output.parent.is_dir():
         raise FileError(f"output must name a file in an existing folder, got {str(output)!r}")
-    content = read(refiner) if refiner.endswith(".safetensors") else _shipped(refiner)
+    content = _content(refiner, weights)
+    _check_exportable(content)
     needed = ["onnx", "onnxruntime"] + (["openvino"] if format == "openvino" else [])
     for module in needed:
         if importlib.util.find_spec(module) is None:
@@ -70,26 +72,40 @@ def export(
     else:
         _write_openvino(model, output)
     document = {
-        "output": str(output), "format": format, "network": content.network, "form": content.form,
+        "output": str(output), "format": format, "network": content.network, "output_mode": content.output_mode,
         "weights": content.fingerprint, "largest_difference_px": difference,
     }  # fmt: skip
     if not write_json(json_file, document):
         typer.echo(f"wrote {output} ({content.network}); largest difference {difference:.2g} pixels")
 
 
-def _shipped(name: str) -> WeightFile:
-    if name not in NETWORKS:
+def _content(refiner: str, weights: str | None) -> WeightFile:
+    if refiner.endswith(".safetensors"):
+        if weights is not None:
+            raise OptionError(f"weights must not be given with a weight file, got {weights!r} and {refiner!r}")
+        return read(refiner)
+    network = {"general": "evidence", "stereokit": "evidence"}.get(refiner, refiner)
+    if network not in NETWORKS:
         raise OptionError(
-            f"refiner to export must be one of {', '.join(NETWORKS)} or a .safetensors file, got {name!r}"
+            f"refiner to export must be one of {', '.join(NETWORKS)} or a .safetensors file, got {refiner!r}"
         )
-    return shipped(name)
+    return find(network, weights)
+
+
+def _check_exportable(content: WeightFile) -> None:
+    """Raise OptionError for the network whose input compiled loops make of both images."""
+    if NETWORKS[content.network].outputs[content.output_mode] is None:
+        raise OptionError(
+            f"refiner to export must be one whose input is the coarse map and the left image, got {content.network!r}: "
+            "its evidence, matching costs of both images, is computed by compiled loops, for which ONNX has no nodes"
+        )
 
 
 def onnx_model(content: WeightFile) -> bytes:
     """Return the refiner of a weight file as a serialised ONNX model."""
     from stereokit_refiners.runtimes.onnx import map_graph
 
-    model: bytes = map_graph(NETWORKS[content.network], content.arrays, content.form).SerializeToString()
+    model: bytes = map_graph(NETWORKS[content.network], content.arrays, content.output_mode).SerializeToString()
     return model
 
 
@@ -103,12 +119,12 @@ def largest_difference(content: WeightFile, model: bytes) -> float:
     coarse[16:32, 20:50] += 8
     confidence = np.maximum(rng.random((rows, columns), np.float32) - np.float32(0.1), np.float32(0))
     left = rng.integers(0, 256, (2 * rows, 2 * columns), dtype=np.uint8)
-    two = np.stack([coarse, coarse[:, ::-1]]) + rng.random((2, rows, columns), np.float32)  # the rival is far off
-    refined = _reference(content, Disparity(coarse, confidence > 0, confidence, candidates=two), left)
+    candidates = np.stack([coarse, coarse[:, ::-1]]) + rng.random((2, rows, columns), np.float32)  # the rival is far
+    refined = _reference(content, Disparity(coarse, confidence > 0, confidence, candidates=candidates), left)
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    feeds = {"coarse": coarse, "confidence": confidence, "candidates": two, "left": left.astype(np.float32)}
-    given = {i.name: feeds[i.name].reshape(1, -1, *feeds[i.name].shape[-2:]) for i in session.get_inputs()}
-    return float(np.abs(session.run(None, given)[0][0, 0] - refined).max())
+    feeds = {"coarse": coarse, "confidence": confidence, "candidates": candidates, "left": left.astype(np.float32)}
+    inputs = {i.name: feeds[i.name].reshape(1, -1, *feeds[i.name].shape[-2:]) for i in session.get_inputs()}
+    return float(np.abs(session.run(None, inputs)[0][0, 0] - refined).max())
 
 
 def _reference(content: WeightFile, coarse: Disparity, left: NDArray[np.uint8]) -> NDArray[np.float32]:

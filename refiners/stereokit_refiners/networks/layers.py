@@ -1,21 +1,39 @@
 """How a network is written down: once, as a table of layers and a function over abstract operations.
 
 A `Network` lists its layers (name, channels, kernel, stride: what the paper's table I gives) and says in
-`Network.forward` how they are connected, in terms of `Ops`. Torch trains that description (`_torch`), OpenVINO and
-ONNX run it (`_openvino`, `_onnx`), and the tests hold all of them to plain loops. No layer is described twice, and
-weights are one flat mapping ``"LAYER.weight"``, ``"LAYER.bias"`` for all.
+`Network.forward` how they are connected, in terms of `Ops`. Torch trains that description; it, OpenVINO, ONNX Runtime
+and OpenCV run it (`stereokit_refiners.runtimes`), and the tests hold all of them to plain loops. No layer is described
+twice, and weights are one flat mapping ``"LAYER.weight"``, ``"LAYER.bias"`` for all. `Network.outputs` are the rules by
+which a map is made of the head.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Layer", "Network", "Ops", "Weights", "activations", "cost", "shapes", "sub_pixel_kernel", "sub_pixel_taps"]
+from stereokit.errors import OptionError
+from stereokit_refiners.outputs.contract import Output
+
+__all__ = [
+    "Layer",
+    "Network",
+    "Ops",
+    "Weights",
+    "activations",
+    "added_to",
+    "block",
+    "check_output_mode",
+    "cost",
+    "output_rule",
+    "shapes",
+    "sub_pixel_kernel",
+    "sub_pixel_taps",
+]
 
 T = TypeVar("T")
 Weights = Mapping[str, NDArray[np.float32]]
@@ -62,7 +80,7 @@ class Ops(Protocol[T]):
         A layer that goes up returns its output at double size.
         """
 
-    def conv_split(self, name: str, inputs: Sequence[T]) -> T:
+    def conv_transpose_phases(self, name: str, inputs: Sequence[T]) -> T:
         """Apply a layer that goes up, without activation, and leave its output in four phases.
 
         Returns (batch, 4 * outputs, rows, columns): channel ``4*o + 2*i + j`` holds output ``o`` at row ``2y + i``,
@@ -81,7 +99,7 @@ class Ops(Protocol[T]):
     def activate(self, name: str, x: T) -> T:
         """Return the leaky ReLU 0.1 of x; the result is called `name`."""
 
-    def twice(self, x: T) -> T:
+    def upsample2x(self, x: T) -> T:
         """Return x at double size, bilinearly, pixel centres kept."""
 
     def repeat(self, x: T) -> T:
@@ -104,7 +122,7 @@ class Network(Protocol):
         """Channels by input's name."""
 
     @property
-    def multiple(self) -> int:
+    def stride(self) -> int:
         """Rows and columns of the input must be multiples of this."""
 
     @property
@@ -112,20 +130,53 @@ class Network(Protocol):
         """Whether inputs come with their channels innermost in memory."""
 
     @property
-    def forms(self) -> tuple[str, ...]:
-        """Which of `stereokit_refiners.runtimes.encode.FORMS` it has."""
+    def outputs(self) -> Mapping[str, Output | None]:
+        """Rules for the head by output mode, the name that weight files give; None where its refiner makes the map."""
 
     def forward(self, ops: Ops[Any], inputs: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the heads, by name; the map is made of ``"map"`` by the network's output rule (`_compose`)."""
+        """Return the heads, by name; an output rule makes the map of ``"map"``."""
+
+
+def check_output_mode(network: Network, mode: str) -> str:
+    """Return `mode`; raise OptionError if it is none of the network's."""
+    if mode not in network.outputs:
+        known = ", ".join(network.outputs)
+        raise OptionError(f"output_mode of {network.name!r} must be one of {known}, got {mode!r}")
+    return mode
+
+
+def output_rule(network: Network, mode: str) -> Output:
+    """Return the rule that makes a full-size map of the network's head and the coarse map.
+
+    Raises
+    ------
+    OptionError
+        If the network has no such mode, or needs more than the coarse map.
+    """
+    rule = network.outputs[check_output_mode(network, mode)]
+    if rule is None:
+        raise OptionError(f"network must be one that sees a half-size map alone here, got {network.name!r}")
+    return rule
+
+
+def block(ops: Ops[T], name: str, x: T) -> T:
+    """Return `x` with what two convolutions make of it added: a residual block (He et al. 2016)."""
+    inner = ops.conv(f"{name}b", [ops.conv(f"{name}a", [x])], activate=False)
+    return ops.activate(name, ops.add(x, inner))
+
+
+def added_to(ops: Ops[T], name: str, skip: T, low: T, upsample: Callable[[T], T]) -> T:
+    """Return `skip` with `low`, of half its size, added: brought to as many channels, then upsampled."""
+    return ops.activate(f"{name}_sum", ops.add(skip, upsample(ops.conv(name, [low], activate=False))))
 
 
 def shapes(network: Network) -> dict[str, tuple[int, ...]]:
     """Return the shape of each weight array of `network`, by name."""
-    found: dict[str, tuple[int, ...]] = {}
+    table: dict[str, tuple[int, ...]] = {}
     for layer in network.layers:
-        found[f"{layer.name}.weight"] = layer.weight_shape
-        found[f"{layer.name}.bias"] = (layer.outputs,)
-    return found
+        table[f"{layer.name}.weight"] = layer.weight_shape
+        table[f"{layer.name}.bias"] = (layer.outputs,)
+    return table
 
 
 class _Sizes:
@@ -134,7 +185,7 @@ class _Sizes:
     def __init__(self, network: Network) -> None:
         self.layers = {layer.name: layer for layer in network.layers}
         self.macs = 0
-        self.seen: dict[str, tuple[int, int, int]] = {}
+        self.outputs: dict[str, tuple[int, int, int]] = {}
         self.activations: dict[str, int] = {}
 
     def conv(self, name: str, inputs: Sequence[tuple[int, int, int]], *, activate: bool = True) -> Any:
@@ -148,12 +199,12 @@ class _Sizes:
         else:
             out = layer.outputs, -(-rows // layer.stride), -(-columns // layer.stride)
             self.macs += out[0] * out[1] * out[2] * channels * layer.kernel**2
-        self.seen[name] = out
+        self.outputs[name] = out
         if activate:
             self.activations[name] = layer.outputs
         return out
 
-    def conv_split(self, name: str, inputs: Sequence[tuple[int, int, int]]) -> Any:
+    def conv_transpose_phases(self, name: str, inputs: Sequence[tuple[int, int, int]]) -> Any:
         outputs, rows, columns = self.conv(name, inputs, activate=False)
         return 4 * outputs, rows // 2, columns // 2
 
@@ -172,10 +223,10 @@ class _Sizes:
         self.activations[name] = x[0]
         return x
 
-    def twice(self, x: Any) -> Any:
+    def upsample2x(self, x: Any) -> Any:
         return x[0], 2 * x[1], 2 * x[2]
 
-    repeat = twice
+    repeat = upsample2x
 
 
 def activations(network: Network) -> dict[str, int]:
@@ -191,7 +242,7 @@ def cost(network: Network, rows: int, columns: int) -> tuple[int, int, dict[str,
     Parameters
     ----------
     rows, columns : int
-        Size of the inputs (half of the map's), multiples of ``network.multiple``.
+        Size of the inputs (half of the map's), multiples of ``network.stride``.
 
     Returns
     -------
@@ -204,7 +255,7 @@ def cost(network: Network, rows: int, columns: int) -> tuple[int, int, dict[str,
     sizes = _Sizes(network)
     network.forward(sizes, {name: (channels, rows, columns) for name, channels in network.inputs.items()})
     parameters = sum(int(np.prod(shape)) for shape in shapes(network).values())
-    return sizes.macs, parameters, sizes.seen
+    return sizes.macs, parameters, sizes.outputs
 
 
 def sub_pixel_taps() -> list[tuple[int, int, int]]:

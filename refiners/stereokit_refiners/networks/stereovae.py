@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from stereokit_refiners.networks.layers import Layer, Ops
+from stereokit_refiners.outputs import Direct, Output, Residual
 
 __all__ = ["NonVae", "StereoVae"]
 
@@ -50,9 +51,9 @@ class StereoVae:
     name: ClassVar[str] = "stereovae"
     layers: ClassVar[tuple[Layer, ...]] = _table(latent=True)
     inputs: ClassVar[dict[str, int]] = {"disparity": 1, "image": 1}
-    multiple: ClassVar[int] = 4
+    stride: ClassVar[int] = 4
     innermost: ClassVar[bool] = False
-    forms: ClassVar[tuple[str, ...]] = ("residual", "literal")
+    outputs: ClassVar[Mapping[str, Output]] = {"residual": Residual(), "direct": Direct()}
     latent: ClassVar[bool] = True
 
     def forward(self, ops: Ops[Any], inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -76,7 +77,7 @@ class StereoVae:
         d_2 = ops.conv("D_2", [*below, d_1_r])
         d_2_r = ops.conv("D_2_R", [d_2, en_1, en_1_r])
         d = ops.conv("D", [d_2, en_1, en_1_r, d_2_r])
-        heads["map"] = ops.conv_split("Y", [d, x0, fe_1, fe_2])
+        heads["map"] = ops.conv_transpose_phases("Y", [d, x0, fe_1, fe_2])
         return heads
 
 

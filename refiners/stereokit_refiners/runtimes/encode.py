@@ -1,8 +1,8 @@
 """What a network sees: the coarse map and the image as floating-point tensors of about unit size.
 
-Two forms. ``"residual"`` is the one that is trained and shipped: ``disparity / 16 - 1.5`` in full-size pixels and
-``4 * (grey / 255 - 0.4)``, and the output corrects the upscaled map. ``"literal"`` is the paper's: both inputs scaled
-to [0, 1], ``disparity / 256`` and ``grey / 255``, and the output is the map itself over 256.
+Two scales, by the network's output rule. Networks that correct a map see ``disparity / 16 - 1.5`` in full-size pixels
+and ``4 * (grey / 255 - 0.4)``. The paper's form, whose output is the map itself, has both inputs scaled to [0, 1]:
+``disparity / 256`` and ``grey / 255``.
 """
 
 from __future__ import annotations
@@ -16,20 +16,10 @@ from numpy.typing import NDArray
 
 from stereokit.errors import OptionError
 
-__all__ = ["BEGINNING", "FORMS", "base_of", "check_form", "encode", "half_image"]
+__all__ = ["BEGINNING", "base_of", "encode", "half_image"]
 
 BEGINNING = 4.0
 """Where maps of the training begin at most, half-size pixels."""
-
-FORMS = ("residual", "literal")
-
-
-def check_form(form: str, known: tuple[str, ...] = FORMS, network: str = "") -> str:
-    """Return `form`; raise OptionError if it is not one of `known`, those of `network`."""
-    if form not in known:
-        owner = f" of {network!r}" if network else ""
-        raise OptionError(f"form{owner} must be one of {', '.join(known)}, got {form!r}")
-    return form
 
 
 def base_of(maps: Sequence[NDArray[np.float32]]) -> float:
@@ -67,7 +57,7 @@ def half_image(left: NDArray[Any]) -> NDArray[np.float32]:
 
 def encode(
     names: tuple[str, ...],
-    form: str,
+    unit: bool,
     disparity: NDArray[np.float32],
     left: NDArray[Any],
     confidence: NDArray[np.float32] | None = None,
@@ -79,7 +69,8 @@ def encode(
     ----------
     names : tuple of str
         Which: "disparity", "image", "confidence", "candidates", "phases".
-    form : {"residual", "literal"}
+    unit : bool
+        Whether inputs are scaled to [0, 1]: `stereokit_refiners.outputs.Output.unit_inputs`.
     disparity : (h, w) float32
         Coarse map in full-size pixels, without NaN.
     left : (2h, 2w) uint8 or float32
@@ -93,21 +84,20 @@ def encode(
     -------
     dict of (C, h, w) float32, C-contiguous
     """
-    literal = form == "literal"
 
     def gray(image: NDArray[Any]) -> NDArray[np.float32]:
         values = image.astype(np.float32) * np.float32(1 / 255)
-        return values if literal else np.asarray((values - np.float32(0.4)) * np.float32(4), np.float32)
+        return values if unit else np.asarray((values - np.float32(0.4)) * np.float32(4), np.float32)
 
     def scaled(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        values = pixels * np.float32(1 / 256) if literal else pixels * np.float32(1 / 16) - np.float32(1.5)
+        values = pixels * np.float32(1 / 256) if unit else pixels * np.float32(1 / 16) - np.float32(1.5)
         return np.asarray(values, np.float32)
 
     makers: dict[str, Callable[[], NDArray[np.float32]]] = {
         "disparity": lambda: scaled(disparity),
-        "candidates": lambda: scaled(_given("candidates", candidates)),
+        "candidates": lambda: scaled(_present("candidates", candidates)),
         "image": lambda: gray(half_image(left)),
-        "confidence": lambda: _given("confidence", confidence) * np.float32(4) - np.float32(2),
+        "confidence": lambda: _present("confidence", confidence) * np.float32(4) - np.float32(2),
         "phases": lambda: np.stack([gray(left[i::2, j::2]) for i in (0, 1) for j in (0, 1)]),
     }
     return {
@@ -115,7 +105,7 @@ def encode(
     }
 
 
-def _given(name: str, map: NDArray[np.float32] | None) -> NDArray[np.float32]:
+def _present(name: str, map: NDArray[np.float32] | None) -> NDArray[np.float32]:
     if map is None:
         raise OptionError(f"coarse must come with {name} for this refiner, as stereokit.Matcher gives it, got none")
     return map

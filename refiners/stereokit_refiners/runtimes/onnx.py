@@ -1,7 +1,7 @@
 """Networks as ONNX graphs: what ONNX Runtime runs, and what `stereokit export` writes.
 
 Built from the network's own description, with transposed convolutions in their sub-pixel form. Rows and columns are
-left open, so that one file serves every size (multiples of ``2 * network.multiple`` in full-size pixels).
+left open, so that one file serves every size (multiples of ``2 * network.stride`` in full-size pixels).
 """
 
 from __future__ import annotations
@@ -14,16 +14,14 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from stereokit.errors import OptionError
-from stereokit_refiners.networks.layers import Network, Weights, sub_pixel_kernel
-from stereokit_refiners.networks.pyramid import CANDIDATES, OFFSETS
+from stereokit_refiners.networks.layers import Network, Weights, output_rule, sub_pixel_kernel
 
 __all__ = ["head_graph", "map_graph", "session"]
 
 _OPSET = 18
 
 
-class _OnnxOps:
+class GraphOps:
     """Ops that append nodes; a tensor is its name."""
 
     def __init__(self, network: Network, weights: Weights) -> None:
@@ -49,7 +47,7 @@ class _OnnxOps:
             y = self.shuffle(y)
         return self.activate(name, y) if activate else y
 
-    def conv_split(self, name: str, inputs: Sequence[str]) -> str:
+    def conv_transpose_phases(self, name: str, inputs: Sequence[str]) -> str:
         return self._convolve(name, inputs)
 
     def _convolve(self, name: str, inputs: Sequence[str]) -> str:
@@ -59,8 +57,8 @@ class _OnnxOps:
             weight, bias = sub_pixel_kernel(weight), np.repeat(bias, 4)
         x = inputs[0] if len(inputs) == 1 else self.node("Concat", inputs, axis=1)
         side = weight.shape[-1] // 2
-        given = [x, self.constant(weight), self.constant(bias)]
-        return str(self.node("Conv", given, pads=[side] * 4, strides=[layer.stride] * 2))
+        operands = [x, self.constant(weight), self.constant(bias)]
+        return str(self.node("Conv", operands, pads=[side] * 4, strides=[layer.stride] * 2))
 
     def shuffle(self, x: str) -> str:
         return str(self.node("DepthToSpace", [x], blocksize=2, mode="CRD"))
@@ -80,7 +78,7 @@ class _OnnxOps:
     def activate(self, name: str, x: str) -> str:
         return str(self.node("LeakyRelu", [x], alpha=0.1))
 
-    def twice(self, x: str) -> str:
+    def upsample2x(self, x: str) -> str:
         scales = self.constant([1, 1, 2, 2])
         return str(self.node("Resize", [x, "", scales], mode="linear", coordinate_transformation_mode="half_pixel"))
 
@@ -98,11 +96,11 @@ class _OnnxOps:
         return str(self.node("Slice", [x, *where]))
 
 
-def _model(ops: _OnnxOps, name: str, inputs: dict[str, list[Any]], output: str, shape: list[Any]) -> onnx.ModelProto:
-    given = [helper.make_tensor_value_info(n, TensorProto.FLOAT, dims) for n, dims in inputs.items()]
+def _model(ops: GraphOps, name: str, inputs: dict[str, list[Any]], output: str, shape: list[Any]) -> onnx.ModelProto:
+    parameters = [helper.make_tensor_value_info(n, TensorProto.FLOAT, dims) for n, dims in inputs.items()]
     ops.nodes.append(helper.make_node("Identity", [output], [name]))
     result = helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-    graph = helper.make_graph(ops.nodes, "stereokit", given, [result], ops.constants)
+    graph = helper.make_graph(ops.nodes, "stereokit", parameters, [result], ops.constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], producer_name="stereokit")
     model.ir_version = 9
     onnx.checker.check_model(model)
@@ -111,14 +109,14 @@ def _model(ops: _OnnxOps, name: str, inputs: dict[str, list[Any]], output: str, 
 
 def head_graph(network: Network, weights: Weights) -> onnx.ModelProto:
     """Return the graph from encoded inputs, (1, C, h, w), to the ``head``, (1, h, w, C)."""
-    ops = _OnnxOps(network, weights)
+    ops = GraphOps(network, weights)
     inputs = {name: [1, channels, "h", "w"] for name, channels in network.inputs.items()}
     head = network.forward(ops, {name: name for name in inputs})["map"]
     return _model(ops, "head", inputs, ops.node("Transpose", [head], perm=[0, 2, 3, 1]), [1, "h", "w", None])
 
 
-def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
-    """Return the whole refiner as a graph, with what `encode` and `compose` do.
+def map_graph(network: Network, weights: Weights, output_mode: str) -> onnx.ModelProto:
+    """Return the whole refiner as a graph, with what `encode` and the output rule do.
 
     Inputs ``coarse``, (1, 1, h, w), half-size pixels, filled; ``left``, (1, 1, 2h, 2w), grey levels 0 to 255; for
     networks that use them ``confidence``, (1, 1, h, w), 0 to 1, and ``candidates``, (1, 2, h, w), half-size pixels.
@@ -129,14 +127,13 @@ def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
     OptionError
         If the network sees more than that.
     """
-    if "disparity" not in network.inputs:
-        raise OptionError(f"network must be one that sees a half-size map alone to be exported, got {network.name!r}")
-    ops = _OnnxOps(network, weights)
-    literal = form == "literal"
+    rule = output_rule(network, output_mode)
+    ops = GraphOps(network, weights)
+    unit = rule.unit_inputs
     inputs: dict[str, list[Any]] = {"coarse": [1, 1, "h", "w"], "left": [1, 1, "2h", "2w"]}
     coarse = ops.multiply("coarse", 2)
-    gray = ops.multiply("left", 1 / 255) if literal else ops.shift(ops.multiply("left", 4 / 255), -1.6)
-    encoded = {"disparity": ops.multiply(coarse, 1 / 256) if literal else ops.shift(ops.multiply(coarse, 1 / 16), -1.5)}
+    gray = ops.multiply("left", 1 / 255) if unit else ops.shift(ops.multiply("left", 4 / 255), -1.6)
+    encoded = {"disparity": ops.multiply(coarse, 1 / 256) if unit else ops.shift(ops.multiply(coarse, 1 / 16), -1.5)}
     if "image" in network.inputs:
         encoded["image"] = ops.node("AveragePool", [gray], kernel_shape=[2, 2], strides=[2, 2])
     if "phases" in network.inputs:
@@ -144,45 +141,19 @@ def map_graph(network: Network, weights: Weights, form: str) -> onnx.ModelProto:
     if "confidence" in network.inputs:
         inputs["confidence"] = [1, 1, "h", "w"]
         encoded["confidence"] = ops.shift(ops.multiply("confidence", 4), -2)
-    two = ""
+    candidates = ""
     if "candidates" in network.inputs:
         inputs["candidates"] = [1, 2, "h", "w"]
-        two = ops.multiply("candidates", 2)
-        encoded["candidates"] = ops.shift(ops.multiply(two, 1 / 16), -1.5)
+        candidates = ops.multiply("candidates", 2)
+        encoded["candidates"] = ops.shift(ops.multiply(candidates, 1 / 16), -1.5)
     head = network.forward(ops, encoded)["map"]
-    if literal:
-        full = ops.multiply(ops.shuffle(head), 256)
-    elif network.name == "stereokit":
-        full = _mixture(ops, head, coarse, two)
-    else:
-        full = ops.add(ops.twice(coarse), ops.multiply(ops.shuffle(head), 4))
+    full = rule.graph_map(ops, head, coarse, candidates)
     return _model(ops, "disparity", inputs, full, [1, 1, "2h", "2w"])
-
-
-def _mixture(ops: _OnnxOps, head: str, coarse: str, candidates: str) -> str:
-    reach = max(max(abs(dy), abs(dx)) for dy, dx in OFFSETS)
-    corrected = ops.add(coarse, ops.multiply(ops.slice(head, 1, 0, 1), 4))
-    pads = ops.constant([0, 0, reach, reach, 0, 0, reach, reach], np.int64)
-    padded = ops.node("Pad", [corrected, pads], mode="edge")
-    around = []
-    for dy, dx in OFFSETS:
-        # A slice that ends `reach - d` before the border of the padded map; its end counts from the far side.
-        rows = ops.slice(padded, 2, reach + dy, dy - reach if dy < reach else 2**31)
-        around.append(ops.slice(rows, 3, reach + dx, dx - reach if dx < reach else 2**31))
-    values = ops.node("Concat", [*around, candidates], axis=1)
-    values = ops.node("Unsqueeze", [values, ops.constant([2], np.int64)])
-    logits = ops.slice(head, 1, 5, 5 + 4 * CANDIDATES)
-    size = ops.node("Shape", [head])
-    tail = ops.node("Slice", [size, *(ops.constant([v], np.int64) for v in (2, 4, 0))])
-    shape = ops.node("Concat", [ops.constant([1, CANDIDATES, 4], np.int64), tail], axis=0)
-    share = ops.node("Softmax", [ops.node("Reshape", [logits, shape])], axis=1)
-    mixed = ops.node("ReduceSum", [ops.node("Mul", [share, values]), ops.constant([1], np.int64)], keepdims=0)
-    return ops.shuffle(ops.add(mixed, ops.multiply(ops.slice(head, 1, 1, 5), 4)))
 
 
 def session(
     network: Network, weights: Weights, threads: int
-) -> Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]:
+) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
     """Return a function from (C, h, w) inputs to the (h, w, C) head that ONNX Runtime computes."""
     import onnxruntime
 
@@ -191,10 +162,10 @@ def session(
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     graph = head_graph(network, weights).SerializeToString()
-    held = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+    model = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
-    def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        given = {name: np.ascontiguousarray(inputs[name][None]) for name in network.inputs}
-        return np.ascontiguousarray(held.run(["head"], given)[0][0])
+    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+        feeds = {name: np.ascontiguousarray(inputs[name][None], np.float32) for name in network.inputs}
+        return np.ascontiguousarray(model.run(["head"], feeds)[0][0])
 
     return run

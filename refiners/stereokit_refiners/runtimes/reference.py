@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit_refiners.networks.layers import Network, Weights, sub_pixel_kernel
-from stereokit_refiners.runtimes.compose import compose
+from stereokit_refiners.networks.layers import Network, Weights, output_rule, sub_pixel_kernel
 from stereokit_refiners.runtimes.encode import encode
 from stereokit_refiners.runtimes.evidence import hypotheses, network_input
 from stereokit_refiners.runtimes.mixture import mixture
@@ -42,12 +41,12 @@ class _PlainOps:
         self.weights = weights
 
     def conv(self, name: str, inputs: Sequence[Array], *, activate: bool = True) -> Array:
-        y = self.conv_split(name, inputs)
+        y = self.conv_transpose_phases(name, inputs)
         if self.table[name].up:
             y = _shuffled(y)
         return self.activate(name, y) if activate else y
 
-    def conv_split(self, name: str, inputs: Sequence[Array]) -> Array:
+    def conv_transpose_phases(self, name: str, inputs: Sequence[Array]) -> Array:
         layer = self.table[name]
         weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
         if layer.up:
@@ -76,7 +75,7 @@ class _PlainOps:
     def activate(self, name: str, x: Array) -> Array:
         return np.asarray(np.where(x < 0, x * np.float32(0.1), x), np.float32)
 
-    def twice(self, x: Array) -> Array:
+    def upsample2x(self, x: Array) -> Array:
         for axis in (1, 2):
             last = x.shape[axis] - 1
             here = np.arange(last + 1)
@@ -100,9 +99,10 @@ def _shuffled(x: Array) -> Array:
     return np.asarray(phases.reshape(channels, 2 * rows, 2 * columns), np.float32)
 
 
-def forward(network: Network, weights: Weights, inputs: dict[str, Array]) -> Array:
+def forward(network: Network, weights: Weights, inputs: dict[str, NDArray[Any]]) -> Array:
     """Return the (h, w, C) head for (C, h, w) inputs."""
-    head = network.forward(_PlainOps(network, weights), inputs)["map"]
+    given = {name: np.asarray(each, np.float32) for name, each in inputs.items()}
+    head = network.forward(_PlainOps(network, weights), given)["map"]
     return np.ascontiguousarray(head.transpose(1, 2, 0))
 
 
@@ -132,19 +132,15 @@ def _weighs(content: WeightFile) -> bool:
     return "evidence" in network_named(content.network).inputs
 
 
-def _prepared(content: WeightFile) -> tuple[dict[str, Array], Callable[[Array], Array]]:
+def _prepared(content: WeightFile) -> tuple[dict[str, NDArray[Any]], Callable[[Array], Array]]:
     """Return a network's inputs for the scene, and what makes a map of its head."""
     network, scene = network_named(content.network), _scene()
     rows, columns = (2 * length for length in SCENE_SIZE)
+    inputs: dict[str, NDArray[Any]]
     if not _weighs(content):
-        inputs = encode(tuple(network.inputs), content.form, **scene)
-
-        def composed(head: Array) -> Array:
-            return compose(
-                content.network, content.form, head, scene["disparity"], rows, columns, candidates=scene["candidates"]
-            )
-
-        return inputs, composed
+        rule = output_rule(network, content.output_mode)
+        inputs = encode(tuple(network.inputs), rule.unit_inputs, **scene)
+        return inputs, lambda head: rule.map(head, scene["disparity"], rows, columns, candidates=scene["candidates"])
     left = scene["left"]
     right = np.roll(left, -24, axis=1)
     found = hypotheses(scene["disparity"], scene["candidates"], left, right, 2)
@@ -152,7 +148,7 @@ def _prepared(content: WeightFile) -> tuple[dict[str, Array], Callable[[Array], 
     return inputs, lambda head: mixture(head, found, rows, columns)[0]
 
 
-def mistake(content: WeightFile, run: Callable[[dict[str, Array]], Array]) -> float:
+def mistake(content: WeightFile, run: Callable[[dict[str, NDArray[Any]]], Array]) -> float:
     """Return how far a runtime's map of a small scene is off on average, full-size pixels; infinite if not a number.
 
     Parameters

@@ -17,9 +17,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from stereokit.errors import InputError, OptionError
+from stereokit_refiners.networks.layers import output_rule
 from stereokit_refiners.runtimes.encode import BEGINNING
-from stereokit_refiners.runtimes.torch import Module, compose
-from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped
+from stereokit_refiners.runtimes.torch import Module
+from stereokit_refiners.weights import NETWORKS, WeightFile, find, read
 
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
@@ -33,9 +34,11 @@ class TensorRefiner:
     Parameters
     ----------
     refiner : str or WeightFile
-        A name ("stereovae", "cnn", "stereokit"), the path of a ``.safetensors`` file, or its content.
+        A name ("stereovae", "cnn", "pyramid"), the path of a ``.safetensors`` file, or its content.
     device : str
         Where to compute: "cuda", "cuda:1", "cpu".
+    weights : str or None
+        Of a name: a weight file, or a collection such as "kitti".
 
     Raises
     ------
@@ -45,9 +48,9 @@ class TensorRefiner:
         If the weights cannot be used.
     """
 
-    def __init__(self, refiner: str | WeightFile, device: str = "cuda") -> None:
+    def __init__(self, refiner: str | WeightFile, device: str = "cuda", *, weights: str | None = None) -> None:
         if isinstance(refiner, str):
-            refiner = read(refiner) if refiner.endswith(".safetensors") else shipped(refiner)
+            refiner = read(refiner) if refiner.endswith(".safetensors") else find(refiner, weights)
         try:
             self.device = torch.device(device)
             torch.empty(0, device=self.device)
@@ -56,6 +59,7 @@ class TensorRefiner:
             raise OptionError(f"device must be one that torch has, got {device!r} ({reason})") from None
         self.content = refiner
         self.network = NETWORKS[refiner.network]
+        self._rule = output_rule(self.network, refiner.output_mode)
         self._module = Module(self.network)
         self._module.load(refiner.arrays)
         self._module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -84,47 +88,49 @@ class TensorRefiner:
         InputError
             If the sizes do not fit one another.
         """
-        for name, given in (("confidence", confidence), ("candidates", candidates)):
-            if given is None and name in self.network.inputs:
+        for name, array in (("confidence", confidence), ("candidates", candidates)):
+            if array is None and name in self.network.inputs:
                 raise InputError(f"{name} must be given for refiner {self.network.name!r}, got None")
         disparity, image = (torch.as_tensor(x, device=self.device) for x in (coarse, left))
-        known = torch.zeros_like(disparity) if confidence is None else torch.as_tensor(confidence, device=self.device)
-        two = torch.stack([disparity] * 2) if candidates is None else torch.as_tensor(candidates, device=self.device)
+        sureness = (
+            torch.zeros_like(disparity) if confidence is None else torch.as_tensor(confidence, device=self.device)
+        )
+        pair = torch.stack([disparity] * 2) if candidates is None else torch.as_tensor(candidates, device=self.device)
         if image.ndim != 2 or disparity.shape != ((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2):
-            found = f"{tuple(disparity.shape)} and {tuple(image.shape)}"
-            raise InputError(f"coarse must be (H/2, W/2), rounded up, of left (H, W), got {found}")
-        if known.shape != disparity.shape:
-            wanted, found = tuple(disparity.shape), str(tuple(known.shape))
-            raise InputError(f"confidence must have the shape of coarse {wanted}, got {found}")
-        if two.shape != (2, *disparity.shape):
+            sizes = f"{tuple(disparity.shape)} and {tuple(image.shape)}"
+            raise InputError(f"coarse must be (H/2, W/2), rounded up, of left (H, W), got {sizes}")
+        if sureness.shape != disparity.shape:
+            shapes = f"{tuple(disparity.shape)}, got {tuple(sureness.shape)}"
+            raise InputError(f"confidence must have the shape of coarse {shapes}")
+        if pair.shape != (2, *disparity.shape):
             rule = f"candidates must be two maps of the shape of coarse {tuple(disparity.shape)}"
-            raise InputError(f"{rule}, got {tuple(two.shape)}")
+            raise InputError(f"{rule}, got {tuple(pair.shape)}")
         rows, columns = image.shape
         height, width = disparity.shape
-        below, beside = -height % self.network.multiple, -width % self.network.multiple
+        below, beside = -height % self.network.stride, -width % self.network.stride
         with torch.inference_mode():
-            given = [disparity.float(), two.float()] if "candidates" in self.network.inputs else [disparity.float()]
-            lowest = torch.stack([one.min() for one in given]).min()
-            highest = torch.stack([one.max() for one in given]).max()
-            shift = _base_of(given[0], lowest)
+            maps = [disparity.float(), pair.float()] if "candidates" in self.network.inputs else [disparity.float()]
+            lowest = torch.stack([one.min() for one in maps]).min()
+            highest = torch.stack([one.max() for one in maps]).max()
+            shift = _base_of(maps[0], lowest)
             disparity = _extended((disparity.float() - shift) * 2, below, beside)
-            known = _extended(known.float(), below, beside)
-            two = _extended((two.float() - shift) * 2, below, beside)
+            sureness = _extended(sureness.float(), below, beside)
+            pair = _extended((pair.float() - shift) * 2, below, beside)
             gray = _extended(image.float(), 2 * (height + below) - rows, 2 * (width + beside) - columns)
-            heads = self._module(self._encoded(disparity, known, two, gray))
-            full = compose(self.network.name, self.content.form, heads["map"], disparity, two)
+            heads = self._module(self._encoded(disparity, sureness, pair, gray))
+            full = self._rule.tensor_map(heads["map"], disparity, pair)
             return (full[0, 0, :rows, :columns] + 2 * shift).clamp(2 * lowest, 2 * highest).contiguous()
 
-    def _encoded(self, disparity: Tensor, confidence: Tensor, two: Tensor, left: Tensor) -> dict[str, Tensor]:
+    def _encoded(self, disparity: Tensor, confidence: Tensor, candidates: Tensor, left: Tensor) -> dict[str, Tensor]:
         """Return the network's inputs: `stereokit_refiners.runtimes.encode.encode` in torch."""
-        literal = self.content.form == "literal"
-        gray = left / 255 if literal else (left / 255 - 0.4) * 4
+        unit = self._rule.unit_inputs
+        gray = left / 255 if unit else (left / 255 - 0.4) * 4
         encoded = {
-            "disparity": disparity / 256 if literal else disparity / 16 - 1.5,
+            "disparity": disparity / 256 if unit else disparity / 16 - 1.5,
             "image": F.avg_pool2d(gray, 2),
             "phases": F.pixel_unshuffle(gray, 2),
             "confidence": confidence * 4 - 2,
-            "candidates": two / 16 - 1.5,
+            "candidates": candidates / 16 - 1.5,
         }
         return {name: encoded[name] for name in self.network.inputs}
 
@@ -134,7 +140,7 @@ def refine_on_device(
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Refine a map that lies on the GPU with a network; see `stereokit_refiners.contract.DeviceRefiner`."""
     with _running_on(stream, left) as device:
-        refined = _held(content, str(device))(coarse.disparity, coarse.confidence, left, coarse.candidates)
+        refined = _cached_refiner(content, str(device))(coarse.disparity, coarse.confidence, left, coarse.candidates)
         rows, columns = refined.shape
         sure = None if coarse.confidence is None else _doubled(_tensor(coarse.confidence), rows, columns)
         return refined, _doubled(_tensor(coarse.valid), rows, columns), sure
@@ -172,13 +178,13 @@ def _base_of(disparity: Tensor, lowest: Tensor) -> Tensor:
     return torch.where(lowest < 0, lowest.floor(), (first - BEGINNING).floor().clamp(min=0))
 
 
-def _tensor(held: Any) -> Tensor:
+def _tensor(array: Any) -> Tensor:
     """Return an array as a tensor of the same memory."""
-    return torch.as_tensor(held)
+    return torch.as_tensor(array)
 
 
 @lru_cache(maxsize=8)
-def _held(content: WeightFile, device: str) -> TensorRefiner:
+def _cached_refiner(content: WeightFile, device: str) -> TensorRefiner:
     return TensorRefiner(content, device)
 
 

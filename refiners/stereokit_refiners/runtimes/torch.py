@@ -1,8 +1,9 @@
-"""Networks in torch: what is trained, and what runs on a GPU. The only file but training that imports torch."""
+"""Networks in torch: what is trained, and what runs on a GPU."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,9 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from stereokit_refiners.networks.layers import Layer, Network, sub_pixel_taps
-from stereokit_refiners.networks.pyramid import CANDIDATES, OFFSETS
 
-__all__ = ["Module", "calibrate", "compose", "runner"]
+__all__ = ["Module", "calibrate", "runner"]
 
 
 class Module(nn.Module):
@@ -47,13 +47,9 @@ class Module(nn.Module):
             for name in self.table:
                 if name.startswith("block_") and name.endswith("b"):
                     self.weights[_key(name, "weight")].mul_(0.3)
-            if self.network.name == "stereokit":
-                logits = self.weights[_key("head", "bias")][5:].view(CANDIDATES, 4)
-                for phase in range(4):
-                    for k, (dy, dx) in enumerate(OFFSETS):
-                        near = (dy - (phase // 2 - 0.5) * 0.5) ** 2 + (dx - (phase % 2 - 0.5) * 0.5) ** 2
-                        logits[k, phase] = -1.5 * near
-                    logits[len(OFFSETS) :, phase] = -1.5
+            for rule in self.network.outputs.values():
+                if rule is not None and rule.initial_bias is not None:
+                    self.weights[_key(last, "bias")].copy_(torch.from_numpy(rule.initial_bias))
 
     def forward(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the network's heads for (B, C, h, w) inputs by name."""
@@ -90,12 +86,12 @@ class _TorchOps:
     def conv(self, name: str, inputs: Sequence[Tensor], *, activate: bool = True) -> Tensor:
         layer, weight, bias = self._layer(name)
         if layer.up:
-            y = F.pixel_shuffle(self.conv_split(name, inputs), 2)
+            y = F.pixel_shuffle(self.conv_transpose_phases(name, inputs), 2)
         else:
             y = F.conv2d(_joined(inputs), weight, bias, layer.stride, layer.kernel // 2)
         return self.activate(name, y) if activate else y
 
-    def conv_split(self, name: str, inputs: Sequence[Tensor]) -> Tensor:
+    def conv_transpose_phases(self, name: str, inputs: Sequence[Tensor]) -> Tensor:
         _, weight, bias = self._layer(name)
         return F.conv2d(_joined(inputs), _sub_pixel(weight), bias.repeat_interleave(4), padding=1)
 
@@ -113,7 +109,7 @@ class _TorchOps:
     def activate(self, name: str, x: Tensor) -> Tensor:
         return F.leaky_relu(x, 0.1)
 
-    def twice(self, x: Tensor) -> Tensor:
+    def upsample2x(self, x: Tensor) -> Tensor:
         return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
     def repeat(self, x: Tensor) -> Tensor:
@@ -136,53 +132,18 @@ def _sub_pixel(weight: Tensor) -> Tensor:
     return kernel.reshape(4 * outputs, inputs, 3, 3)
 
 
-def compose(name: str, form: str, head: Tensor, coarse: Tensor, candidates: Tensor | None = None) -> Tensor:
-    """Return the full-size map of a network's head; the twin of `stereokit_refiners.runtimes.compose.compose`.
-
-    Parameters
-    ----------
-    name, form : str
-        Architecture, and "residual" or "literal".
-    head : (B, C, h, w)
-        The network's ``map``.
-    coarse : (B, 1, h, w)
-        Coarse map in full-size pixels.
-    candidates : (B, 2, h, w) or None
-        The matcher's candidates in full-size pixels, for the mixture.
-
-    Returns
-    -------
-    (B, 1, 2h, 2w), full-size pixels
-    """
-    head = head.float()
-    if form == "literal":
-        return F.pixel_shuffle(head, 2) * 256
-    if name != "stereokit":
-        return F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + 4 * F.pixel_shuffle(
-            head, 2
-        )
-    assert candidates is not None
-    rows, columns = head.shape[-2:]
-    reach = max(max(abs(dy), abs(dx)) for dy, dx in OFFSETS)
-    padded = F.pad(coarse + 4 * head[:, :1], (reach,) * 4, mode="replicate")
-    around = [padded[:, :, reach + dy : reach + dy + rows, reach + dx : reach + dx + columns] for dy, dx in OFFSETS]
-    values = torch.stack([*around, candidates[:, :1], candidates[:, 1:]], 1)
-    share = head[:, 5:].reshape(-1, CANDIDATES, 4, rows, columns).softmax(1)
-    return F.pixel_shuffle((share * values).sum(1) + 4 * head[:, 1:5], 2)
-
-
 def runner(
     network: Network, arrays: Mapping[str, NDArray[np.float32]]
-) -> Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]:
+) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
     """Return a function from (C, h, w) inputs to the (h, w, C) head, on the GPU if torch has one."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     module = Module(network)
     module.load(arrays)
     module.to(device, memory_format=torch.channels_last).eval().requires_grad_(False)  # type: ignore[call-overload]
 
-    def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
         with torch.inference_mode():
-            tensors = {name: torch.from_numpy(inputs[name])[None].to(device) for name in network.inputs}
+            tensors = {name: torch.from_numpy(inputs[name])[None].to(device).float() for name in network.inputs}
             head = module(tensors)["map"][0].permute(1, 2, 0)
             return np.ascontiguousarray(head.cpu().numpy())
 
@@ -206,8 +167,8 @@ def calibrate(module: Module, batches: Iterable[Mapping[str, Tensor]], share: fl
         def activate(self, name: str, x: Tensor) -> Tensor:
             y = super().activate(name, x)
             size = y.abs().transpose(0, 1).flatten(1).float()
-            kept = max(1, round(size.shape[1] * (1 - share)))
-            bound = size.topk(kept, dim=1).values[:, -1]
+            largest = max(1, round(size.shape[1] * (1 - share)))
+            bound = size.topk(largest, dim=1).values[:, -1]
             ranges[name] = torch.maximum(ranges[name], bound) if name in ranges else bound
             self.names[id(y)] = name, y
             return y

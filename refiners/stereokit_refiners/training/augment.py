@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Views", "mirrored", "moved_objects", "photographed", "rescaled"]
+__all__ = ["Views", "copy_paste", "mirrored", "photographed", "rescaled"]
 
 _DENSE = 0.85  # share of known pixels around a pixel of an object: KITTI's cars are dense, all else is scanned lines
 _SMALLEST, _LARGEST = 1500, 60000  # pixels of an object
@@ -51,7 +51,7 @@ def mirrored(views: Views) -> Views:
     return Views(left, right, flipped, flipped)
 
 
-def moved_objects(rng: np.random.Generator, views: Views, most: int = 3) -> Views:
+def copy_paste(rng: np.random.Generator, views: Views, most: int = 3) -> Views:
     """Return the pair with up to `most` copies of its own objects, moved along their rows.
 
     Objects are what has dense ground truth in a map that is sparse elsewhere, as the cars of KITTI 2015. On the same
@@ -59,15 +59,15 @@ def moved_objects(rng: np.random.Generator, views: Views, most: int = 3) -> View
     """
     if np.mean(np.isfinite(views.noc)) > 0.6:  # dense all over: objects do not stand out
         return views
-    found = _objects(views)
-    for _ in range(int(rng.integers(0, most + 1)) if found else 0):
-        views = _pasted(rng, views, *found[int(rng.integers(len(found)))])
+    objects = _objects(views)
+    for _ in range(int(rng.integers(0, most + 1)) if objects else 0):
+        views = _pasted(rng, views, *objects[int(rng.integers(len(objects)))])
     return views
 
 
 def _objects(views: Views) -> list[tuple[Views, NDArray[np.bool_], NDArray[np.float32]]]:
     """Return every object, seen both ways: the pair it is of, its pixels in the left view, its disparity there."""
-    found = []
+    objects = []
     for origin in (views, mirrored(views)):
         known = np.isfinite(origin.noc)
         around = cv2.boxFilter(known.astype(np.float32), -1, (7, 7), borderType=cv2.BORDER_REPLICATE)
@@ -82,8 +82,8 @@ def _objects(views: Views) -> list[tuple[Views, NDArray[np.bool_], NDArray[np.fl
             with np.errstate(invalid="ignore"):
                 own = np.abs(disparity - middle) < 0.35 * middle
             mask = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)) > 0
-            found.append((origin, mask, np.where(own, disparity, np.float32(np.nan)).astype(np.float32)))
-    return found
+            objects.append((origin, mask, np.where(own, disparity, np.float32(np.nan)).astype(np.float32)))
+    return objects
 
 
 def _pasted(

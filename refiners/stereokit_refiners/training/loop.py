@@ -25,11 +25,11 @@ from torch import Tensor
 
 from stereokit.errors import OptionError
 from stereokit.io import make_folder, parsing, write_bytes
-from stereokit_refiners.networks.layers import Network, Weights
-from stereokit_refiners.runtimes.encode import base_of, check_form, encode
-from stereokit_refiners.runtimes.torch import Module, calibrate, compose
+from stereokit_refiners.networks.layers import Network, Weights, check_output_mode, output_rule
+from stereokit_refiners.runtimes.encode import base_of, encode
+from stereokit_refiners.runtimes.torch import Module, calibrate
 from stereokit_refiners.training.losses import distance, divergence
-from stereokit_refiners.training.samples import Crop, Sample, Shelf, crop, whole
+from stereokit_refiners.training.samples import Crop, Sample, SampleFiles, crop, whole
 from stereokit_refiners.training.settings import PRESETS, Settings
 
 __all__ = ["PRESETS", "History", "Settings", "Source", "bad_pixels", "calibrated", "fit", "predict", "restored"]
@@ -69,13 +69,13 @@ def _device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _batch(network: Network, form: str, crops: Sequence[Crop]) -> dict[str, Tensor]:
+def _batch(network: Network, output_mode: str, crops: Sequence[Crop]) -> dict[str, Tensor]:
     """Return crops as tensors, all (B, C, ., .).
 
     The network's inputs, and in pixels ``coarse``, ``values`` (of the candidates) and ``truth``, and ``weight``.
     """
-    names = tuple(network.inputs)
-    encoded = [encode(names, form, c.disparity, c.left, c.confidence, c.candidates) for c in crops]
+    names, unit = tuple(network.inputs), output_rule(network, output_mode).unit_inputs
+    encoded = [encode(names, unit, c.disparity, c.left, c.confidence, c.candidates) for c in crops]
     arrays = {name: np.stack([inputs[name] for inputs in encoded]) for name in names}
     arrays["values"] = np.stack([c.candidates for c in crops])
     arrays["coarse"] = np.stack([c.disparity[None] for c in crops])
@@ -94,7 +94,7 @@ def _draw(
         source = sources[int(rng.choice(len(sources), p=shares / shares.sum()))]
         sample = source.samples[int(rng.integers(len(source.samples)))]
         crops.append(crop(sample, settings.rows, settings.columns, rng))
-    return _batch(network, settings.form, crops)
+    return _batch(network, settings.output_mode, crops)
 
 
 def _batches(
@@ -125,7 +125,7 @@ def _rate(settings: Settings, step: int) -> float:
 def _loss(
     settings: Settings, network: Network, heads: dict[str, Tensor], batch: dict[str, Tensor], step: int
 ) -> Tensor:
-    estimate = compose(network.name, settings.form, heads["map"], batch["coarse"], batch["values"])
+    estimate = output_rule(network, settings.output_mode).tensor_map(heads["map"], batch["coarse"], batch["values"])
     kind = settings.finish if settings.finish and 3 * step >= 2 * settings.steps else settings.loss
     pixels = distance(kind, estimate - batch["truth"], batch["truth"]) * batch["weight"]
     loss = pixels.sum() / batch["weight"].sum().clamp(min=1)
@@ -140,23 +140,23 @@ def _precision(device: torch.device, half: bool) -> Iterator[None]:
         yield
 
 
-def predict(module: Module, form: str, sample: Sample, *, half: bool = False) -> NDArray[np.float32]:
+def predict(module: Module, output_mode: str, sample: Sample, *, half: bool = False) -> NDArray[np.float32]:
     """Return the refined map of a whole sample, (H, W) float32 in full-size pixels, as the refiner makes it."""
     device = next(module.parameters()).device
-    part = whole(sample, module.network.multiple)
+    part = whole(sample, module.network.stride)
     height, width = sample.coarse.shape
-    given = [part.disparity[:height, :width]]
+    maps = [part.disparity[:height, :width]]
     if "candidates" in module.network.inputs:
-        given.append(part.candidates[:, :height, :width])
-    shift = np.float32(2 * base_of([one / np.float32(2) for one in given]))  # half-size pixels, as the refiner's
-    low, high = min(one.min() for one in given), max(one.max() for one in given)
+        maps.append(part.candidates[:, :height, :width])
+    shift = np.float32(2 * base_of([one / np.float32(2) for one in maps]))  # half-size pixels, as the refiner's
+    low, high = min(one.min() for one in maps), max(one.max() for one in maps)
     part = replace(part, disparity=part.disparity - shift, candidates=part.candidates - shift)
-    batch = {name: tensor.to(device) for name, tensor in _batch(module.network, form, [part]).items()}
+    batch = {name: tensor.to(device) for name, tensor in _batch(module.network, output_mode, [part]).items()}
     training = module.training
     module.eval()
     with torch.inference_mode(), _precision(device, half):
         heads = module({name: batch[name] for name in module.network.inputs})
-        full = compose(module.network.name, form, heads["map"], batch["coarse"], batch["values"])
+        full = output_rule(module.network, output_mode).tensor_map(heads["map"], batch["coarse"], batch["values"])
     module.train(training)
     rows, columns = sample.size
     estimate: NDArray[np.float32] = full[0, 0, :rows, :columns].float().cpu().numpy() + shift
@@ -178,7 +178,7 @@ def bad_pixels(estimate: NDArray[np.float32], sample: Sample, *, occluded: bool 
 
 
 def _score(module: Module, settings: Settings, samples: Sequence[Sample]) -> float | None:
-    counts = [bad_pixels(predict(module, settings.form, s, half=settings.half), s) for s in samples]
+    counts = [bad_pixels(predict(module, settings.output_mode, s, half=settings.half), s) for s in samples]
     known = sum(n for _, n in counts)
     return 100 * sum(bad for bad, _ in counts) / known if known else None
 
@@ -217,7 +217,7 @@ def fit(
     """
     if not sources or not all(source.samples for source in sources):
         raise OptionError("sources must hold at least one sample each, got an empty one")
-    check_form(settings.form, network.forms, network.name)
+    check_output_mode(network, settings.output_mode)
     identity = _described(network, sources, validation, settings, start, world)
     device = _device()
     module = Module(network, torch.Generator().manual_seed(settings.seed))
@@ -319,13 +319,13 @@ def restored(network: Network, arrays: Weights) -> Module:
     return module.eval()
 
 
-def calibrated(module: Module, form: str, sources: Sequence[Source], count: int = 24) -> dict[str, list[float]]:
+def calibrated(module: Module, output_mode: str, sources: Sequence[Source], count: int = 24) -> dict[str, list[float]]:
     """Return the ranges of the activations for int8, over whole samples taken evenly from `sources`."""
     batches = []
     for source in sources:
         step = max(1, len(source.samples) * len(sources) // count)
         for sample in source.samples[::step]:
-            batches.append(_batch(module.network, form, [whole(sample, module.network.multiple)]))
+            batches.append(_batch(module.network, output_mode, [whole(sample, module.network.stride)]))
     return calibrate(module, ({name: b[name] for name in module.network.inputs} for b in batches))
 
 
@@ -336,13 +336,13 @@ def _described(
     """Return all that a training depends on, for the checkpoint."""
 
     def digest(samples: Sequence[Sample]) -> int:
-        if isinstance(samples, Shelf):
+        if isinstance(samples, SampleFiles):
             return samples.digest
-        found = 0
+        number = 0
         for sample in samples:
             for array in (sample.coarse, sample.left, sample.truth):
-                found = zlib.crc32(array.tobytes(), found)
-        return found
+                number = zlib.crc32(array.tobytes(), number)
+        return number
 
     begun = 0
     for name in sorted(start or {}):

@@ -2,7 +2,7 @@
 
 Before matching, a pair is rescaled (disparities with it), its brightness and noise are changed, and the matcher's
 penalties and filters are drawn around their defaults, so that a refiner meets the mistakes of a matcher rather than
-those of a few images. Each *variant* is a function of (pair, method, seed, number) alone: it is made once, kept in a
+those of a few images. Each *variant* is a function of (pair, method, seed, number) alone: it is made once, stored in a
 cache folder under a name that says all of that, and the same on every machine. Variant 0 is the pair as it is.
 """
 
@@ -28,11 +28,11 @@ from stereokit.kernels.jit import FINGERPRINT
 from stereokit.methods import parse_method
 from stereokit.notices import collecting
 from stereokit.result import Disparity
-from stereokit_refiners.training.augment import Views, mirrored, moved_objects, photographed, rescaled
+from stereokit_refiners.training.augment import Views, copy_paste, mirrored, photographed, rescaled
 
-__all__ = ["Crop", "Pair", "Sample", "Shelf", "crop", "load_variant", "make_variant", "store_variant", "whole"]
+__all__ = ["Crop", "Pair", "Sample", "SampleFiles", "crop", "load_variant", "make_variant", "store_variant", "whole"]
 
-_STEP = np.float32(1 / 256)  # maps are kept as KITTI keeps them
+_STEP = np.float32(1 / 256)  # of a pixel, as in KITTI
 _HERE = Path(__file__)
 _SOURCES = _HERE.read_bytes() + _HERE.with_name("augment.py").read_bytes()
 _OWN = hashlib.sha256(_SOURCES).hexdigest()[:8]  # says what made a cached sample
@@ -60,10 +60,10 @@ class Pair:
     @cached_property
     def digest(self) -> str:
         """A fingerprint of the content."""
-        found = hashlib.sha256()
+        digest = hashlib.sha256()
         for array in (self.left, self.right, self.noc, self.occ):
-            found.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-        return found.hexdigest()[:16]
+            digest.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """What a network is shown and held to, in floating point.
+    """Input and target of a network, in floating point.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class Crop:
         Full-size pixels; 0 where `weight` is.
     weight : (2h, 2w) float32
         2 where both cameras see the pixel, 1 where only the left one does, 0 where the truth is unknown: the
-        paper's first loss, which counts pixels of both ground truths twice.
+        paper's first loss, which counts pixels of both ground truths two times.
     """
 
     disparity: NDArray[np.float32]
@@ -156,14 +156,14 @@ def crop(sample: Sample, rows: int, columns: int, rng: np.random.Generator) -> C
     more = ((0, rows - part.disparity.shape[0]), (0, columns - part.disparity.shape[1]))
     if more == ((0, 0), (0, 0)):
         return Crop(part.disparity, part.confidence, part.candidates, left.astype(np.float32), part.truth, part.weight)
-    twice = tuple((0, 2 * amount) for _, amount in more)
+    doubled = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
         np.pad(part.confidence, more, mode="edge"),
         np.pad(part.candidates, ((0, 0), *more), mode="edge"),
-        np.pad(left, twice, mode="edge").astype(np.float32),
-        np.pad(part.truth, twice),
-        np.pad(part.weight, twice),
+        np.pad(left, doubled, mode="edge").astype(np.float32),
+        np.pad(part.truth, doubled),
+        np.pad(part.weight, doubled),
     )
 
 
@@ -172,14 +172,14 @@ def whole(sample: Sample, multiple: int) -> Crop:
     height, width = sample.coarse.shape
     part = _cut(sample, 0, 0, height, width)
     more = ((0, -height % multiple), (0, -width % multiple))
-    twice = tuple((0, 2 * amount) for _, amount in more)
+    doubled = tuple((0, 2 * amount) for _, amount in more)
     return Crop(
         np.pad(part.disparity, more, mode="edge"),
         np.pad(part.confidence, more, mode="edge"),
         np.pad(part.candidates, ((0, 0), *more), mode="edge"),
-        np.pad(part.left, twice, mode="edge"),
-        np.pad(part.truth, twice),
-        np.pad(part.weight, twice),
+        np.pad(part.left, doubled, mode="edge"),
+        np.pad(part.truth, doubled),
+        np.pad(part.weight, doubled),
     )
 
 
@@ -206,15 +206,15 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
         rng = np.random.default_rng([seed, number, int(pair.digest[:8], 16)])
         if number % 2 == 0 and np.isfinite(views.noc).any():
             views = mirrored(views)
-        views = photographed(rng, rescaled(rng, moved_objects(rng, views)))
+        views = photographed(rng, rescaled(rng, copy_paste(rng, views)))
         options = _drawn_options(rng, method)
     noc, occ = views.noc, views.occ
     left, right = _even(views.left), _even(views.right)
-    keeper = _Keeper()
-    matcher = stereokit.Matcher(method, max_disparity=max_disparity, scale=0.5, refiner=keeper, threads=1, **options)
+    capture = _CaptureCoarse()
+    matcher = stereokit.Matcher(method, max_disparity=max_disparity, scale=0.5, refiner=capture, threads=1, **options)
     with collecting():  # hard pairs are wanted
         matcher(left, right)
-    found = keeper.coarse
+    coarse_map = capture.coarse
     height, width = left.shape
     truth = np.zeros((height, width), np.uint16)
     seen = np.zeros((height, width), np.bool_)
@@ -222,17 +222,17 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
     seen[:rows, :columns] = np.isfinite(noc)
     known = np.where(np.isfinite(noc), noc, occ)
     truth[:rows, :columns] = np.where(np.isfinite(known), np.clip(np.rint(known / _STEP), 1, 65535), 0)
-    assert found.confidence is not None and found.candidates is not None
+    assert coarse_map.confidence is not None and coarse_map.candidates is not None
     coarse, candidates = (
         np.clip(np.rint(disparity / _STEP), 0, 65535).astype(np.uint16)
-        for disparity in (found.disparity, found.candidates)
+        for disparity in (coarse_map.disparity, coarse_map.candidates)
     )
-    confidence = np.clip(np.rint(found.confidence * 255), 0, 255).astype(np.uint8)
+    confidence = np.clip(np.rint(coarse_map.confidence * 255), 0, 255).astype(np.uint8)
     return Sample(coarse, confidence, candidates, left, truth, seen, (rows, columns))
 
 
-class _Keeper:
-    """A refiner that keeps the coarse map that it is given."""
+class _CaptureCoarse:
+    """A refiner that stores the coarse map."""
 
     needs_candidates = True
     coarse: Disparity
@@ -294,19 +294,19 @@ def store_variant(pair: Pair, method: str, seed: int, number: int, max_disparity
 
 def _read(path: Path) -> Sample:
     with parsing(path, "sample", "cache must hold samples of this program"), path.open("rb") as file:
-        with np.load(file) as held:
+        with np.load(file) as arrays:
             return Sample(
-                held["coarse"],
-                held["confidence"],
-                held["candidates"],
-                held["left"],
-                held["truth"],
-                held["seen"],
-                tuple(held["size"].tolist()),
+                arrays["coarse"],
+                arrays["confidence"],
+                arrays["candidates"],
+                arrays["left"],
+                arrays["truth"],
+                arrays["seen"],
+                tuple(arrays["size"].tolist()),
             )
 
 
-class Shelf(Sequence[Sample]):
+class SampleFiles(Sequence[Sample]):
     """Samples in files, read each time one is asked for: as many as the disk holds, in little memory.
 
     Parameters
@@ -324,9 +324,9 @@ class Shelf(Sequence[Sample]):
     @overload
     def __getitem__(self, index: int) -> Sample: ...
     @overload
-    def __getitem__(self, index: slice) -> Shelf: ...
-    def __getitem__(self, index: int | slice) -> Sample | Shelf:
-        return Shelf(self._paths[index]) if isinstance(index, slice) else _read(self._paths[index])
+    def __getitem__(self, index: slice) -> SampleFiles: ...
+    def __getitem__(self, index: int | slice) -> Sample | SampleFiles:
+        return SampleFiles(self._paths[index]) if isinstance(index, slice) else _read(self._paths[index])
 
     @property
     def digest(self) -> int:

@@ -10,9 +10,11 @@ from typing import Any
 
 from stereokit.errors import OptionError
 from stereokit.images.check import check_flag, check_integer, check_number
-from stereokit_refiners.runtimes.encode import check_form
 
-__all__ = ["LOSSES", "PRESETS", "Settings"]
+__all__ = ["LOSSES", "OUTPUT_MODES", "PRESETS", "Settings"]
+
+OUTPUT_MODES = ("residual", "direct")
+"""See `stereokit_refiners.networks.layers.Network.outputs`."""
 
 LOSSES = ("l1", "bounded", "d1")
 """See `stereokit_refiners.training.losses`."""
@@ -30,7 +32,7 @@ class Settings:
         Crops per step.
     rows, columns : int
         Size of a crop, half-size pixels.
-    form : {"residual", "literal"}
+    output_mode : {"residual", "direct"}
         See `stereokit_refiners.runtimes.encode`.
     loss : {"l1", "bounded", "d1"}
         See `stereokit_refiners.training.losses`.
@@ -64,7 +66,7 @@ class Settings:
     batch: int = 4
     rows: int = 96
     columns: int = 208
-    form: str = "residual"
+    output_mode: str = "residual"
     loss: str = "l1"
     finish: str | None = None
     divergence: float = 1e-3
@@ -81,7 +83,8 @@ class Settings:
     patience: int = 0
 
     def __post_init__(self) -> None:
-        check_form(self.form)
+        if self.output_mode not in OUTPUT_MODES:
+            raise OptionError(f"output_mode must be one of {', '.join(OUTPUT_MODES)}, got {self.output_mode!r}")
         for loss in (self.loss, self.loss if self.finish is None else self.finish):
             if loss not in LOSSES:
                 raise OptionError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
@@ -105,7 +108,7 @@ class Settings:
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "paper": {
-        "steps": 160_000, "batch": 1, "form": "literal", "loss": "l1", "divergence": 256.0, "learning_rate": 5e-4,
+        "steps": 160_000, "batch": 1, "output_mode": "direct", "loss": "l1", "divergence": 256.0, "learning_rate": 5e-4,
         "schedule": "paper", "betas": (0.99, 0.999), "decay": 0.0, "clip": 0.0, "ema": 0.0, "half": False,
         "rows": 184, "columns": 616, "evaluate_every": 1600,
     },

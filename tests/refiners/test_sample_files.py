@@ -11,7 +11,7 @@ from test_samples import assert_same, pair_of
 
 from stereokit.errors import FileError
 from stereokit_refiners.training import samples
-from stereokit_refiners.training.samples import Shelf, cache_name, load_variant, make_variant, store_variant
+from stereokit_refiners.training.samples import SampleFiles, cache_name, load_variant, make_variant, store_variant
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_names_in_the_cache_say_what_decides(pair, monkeypatch):
 
 
 def test_a_shelf_reads_what_was_stored(pair, stored):
-    shelf = Shelf(stored)
+    shelf = SampleFiles(stored)
     assert len(shelf) == 3
     for number, sample in enumerate(shelf):
         assert_same(sample, make_variant(pair, "S2", 0, number, 32))
@@ -100,11 +100,11 @@ def test_a_shelf_reads_what_was_stored(pair, stored):
     for index in (3, -4):
         with pytest.raises(IndexError):
             shelf[index]
-    assert len(Shelf([])) == 0 and list(Shelf([])) == [] and not Shelf([])
+    assert len(SampleFiles([])) == 0 and list(SampleFiles([])) == [] and not SampleFiles([])
 
 
 def test_a_shelf_reads_each_time_and_only_what_is_asked_for(path):
-    shelf = Shelf([path, path.with_name("none.npz")])
+    shelf = SampleFiles([path, path.with_name("none.npz")])
     first = shelf[0]
     assert shelf[0] is not first
     first.left[:] = 0
@@ -118,31 +118,31 @@ def test_a_shelf_reads_each_time_and_only_what_is_asked_for(path):
     "part", [slice(1, None), slice(None, None, 2), slice(None, None, -1), slice(0, 0), slice(5, 9)], ids=str
 )
 def test_slices_of_a_shelf_are_shelves(part, stored):
-    shelf = Shelf(stored)
+    shelf = SampleFiles(stored)
     found = shelf[part]
-    assert isinstance(found, Shelf)
+    assert isinstance(found, SampleFiles)
     assert len(found) == len(stored[part])
     for sample, path in zip(found, stored[part], strict=True):
-        assert_same(sample, Shelf([path])[0])
-    assert found.digest == Shelf(stored[part]).digest
+        assert_same(sample, SampleFiles([path])[0])
+    assert found.digest == SampleFiles(stored[part]).digest
 
 
 def test_a_slice_reads_nothing(tmp_path):
-    assert len(Shelf([tmp_path / f"{k}.npz" for k in range(9)])[::2]) == 5
+    assert len(SampleFiles([tmp_path / f"{k}.npz" for k in range(9)])[::2]) == 5
 
 
 def test_a_shelf_keeps_its_own_list(stored):
     paths = list(stored)
-    shelf = Shelf(paths)
+    shelf = SampleFiles(paths)
     paths.pop()
     assert len(shelf) == 3
 
 
 def test_digests_say_which_samples_and_not_where(stored, tmp_path):
-    shelf = Shelf(stored)
-    assert shelf.digest == Shelf([tmp_path / path.name for path in stored]).digest
+    shelf = SampleFiles(stored)
+    assert shelf.digest == SampleFiles([tmp_path / path.name for path in stored]).digest
     others = [stored[:2], stored[1:], stored[::-1], [*stored, stored[0]], [stored[0]], []]
-    assert len({shelf.digest, *(Shelf(paths).digest for paths in others)}) == 7
+    assert len({shelf.digest, *(SampleFiles(paths).digest for paths in others)}) == 7
 
 
 def test_a_shelf_trains_as_its_samples_do(stored, tmp_path):
@@ -152,7 +152,7 @@ def test_a_shelf_trains_as_its_samples_do(stored, tmp_path):
 
     from stereokit_refiners.training.loop import Source, calibrated, restored
 
-    network, shelf = NETWORKS["stereokit"], Shelf(stored)
+    network, shelf = NETWORKS["pyramid"], SampleFiles(stored)
     kept = list(shelf)
     checkpoint = tmp_path / "checkpoint.pt"
     arrays, history = fit(network, [Source(shelf)], shelf[:1], settings(steps=3), checkpoint=checkpoint)
@@ -161,7 +161,7 @@ def test_a_shelf_trains_as_its_samples_do(stored, tmp_path):
     assert history.rows == other.rows
     module = restored(network, arrays)
     assert calibrated(module, "residual", [Source(shelf)]) == calibrated(module, "residual", [Source(kept)])
-    again = fit(network, [Source(Shelf(stored))], shelf[:1], settings(steps=3), checkpoint=checkpoint)
+    again = fit(network, [Source(SampleFiles(stored))], shelf[:1], settings(steps=3), checkpoint=checkpoint)
     same_arrays(again[0], arrays)
     with pytest.raises(ValueError, match="checkpoint"):
         fit(network, [Source(shelf[:2])], shelf[:1], settings(steps=3), checkpoint=checkpoint)
@@ -172,7 +172,7 @@ def test_a_shelf_trains_as_its_samples_do(stored, tmp_path):
 
 def refused(path):
     with pytest.raises(FileError) as caught:
-        Shelf([path])[0]
+        SampleFiles([path])[0]
     text = one_line(caught.value)
     assert text.startswith("cache must hold samples of this program, got ") and repr(str(path)) in text, text
     return text
@@ -180,9 +180,9 @@ def refused(path):
 
 def test_a_missing_file(tmp_path):
     with pytest.raises(FileError, match=r"no such file: .*none.npz"):
-        Shelf([tmp_path / "none.npz"])[0]
+        SampleFiles([tmp_path / "none.npz"])[0]
     with pytest.raises(FileError, match="cannot read"):
-        Shelf([tmp_path])[0]
+        SampleFiles([tmp_path])[0]
 
 
 @pytest.mark.parametrize(
@@ -217,16 +217,16 @@ def test_a_file_with_a_wrong_bit(path, at):
 
 @pytest.mark.parametrize("missing", ["confidence", "candidates"])
 def test_a_sample_of_an_older_version(path, missing):
-    sample = vars(Shelf([path])[0])
+    sample = vars(SampleFiles([path])[0])
     np.savez(path, allow_pickle=False, **{k: np.asarray(v) for k, v in sample.items() if k != missing})
     assert missing in refused(path)
 
 
 def test_a_sample_never_runs_code(path):
-    sample = vars(Shelf([path])[0])
+    sample = vars(SampleFiles([path])[0])
     np.savez(path, **{**sample, "left": np.array([{}], object)})
     assert "pickle" in refused(path)
 
 
 def test_fields_are_all_there(pair, stored):
-    assert {f.name for f in dataclasses.fields(Shelf(stored)[0])} == set(np.load(stored[0]).files)
+    assert {f.name for f in dataclasses.fields(SampleFiles(stored)[0])} == set(np.load(stored[0]).files)

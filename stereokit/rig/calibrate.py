@@ -406,7 +406,7 @@ def _rms(rest: Array) -> float:
 
 def _graded(rig: StereoRig, views: Sequence[_View], qualities: list[PairQuality]) -> BoardCalibration:
     """Return the rig with all that tells how good it is."""
-    rectified = _rectification(rig)
+    rectified = rectification_of(rig)
     rows = []
     for view in views:
         left, right = (rectified_pixels(rig, rectified, side, view.pixels[side]) for side in (0, 1))
@@ -442,7 +442,8 @@ def _graded(rig: StereoRig, views: Sequence[_View], qualities: list[PairQuality]
     )
 
 
-def _rectification(rig: StereoRig) -> Rectification:
+def rectification_of(rig: StereoRig) -> Rectification:
+    """Return the rectification of a rig; for a very wide lens that at the focal length of the raw one."""
     try:
         return rig.rectification()
     except OptionError:  # a very wide lens

@@ -26,6 +26,7 @@ from stereokit.cli.options import (
     parse_settings,
 )
 from stereokit.cli.output import Table, report, version_of, waiting
+from stereokit.cli.rig import AlphaOption, RigOption, read_rig_option
 from stereokit.errors import InputError, OptionError
 from stereokit.notices import collecting
 
@@ -61,9 +62,11 @@ def match(
         Path | None, typer.Option(metavar="FILE", help="Also the confidence: .npy, or .png (16-bit, x65535).")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Middlebury, KITTI or JSON calibration, for --ply.")
+        Path | None, typer.Option(metavar="FILE", help="Calibration of a rectified pair, for --ply.")
     ] = None,
     cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Also a point cloud, metres.")] = None,
     memory: Annotated[str | None, typer.Option(metavar="BYTES", help="Match in windows that fit, such as 2GB.")] = None,
     overlap: Annotated[int | None, typer.Option(help="Margin of the windows of --memory, pixels.")] = None,
@@ -73,6 +76,7 @@ def match(
 
     Everything is checked before matching starts. The first run on a machine also compiles, once. With --memory the
     images (.npy, .tiff or any other) are matched in windows, and the map goes to .npy or tiled .tiff as it grows.
+    With --rig the images are raw ones: they are rectified first, and the map is that of the rectified left view.
     """
     import numpy as np
 
@@ -93,8 +97,12 @@ def match(
             check_fits_png(name, min_disparity, max_disparity)
     outputs.update(check_json(json_file))
     _check_distinct({"LEFT": left, "RIGHT": right_image, "--calibration": calibration}, outputs)
-    if (ply is None) != (calibration is None):
+    if rig is not None and calibration is not None:
+        raise OptionError("--rig and --calibration exclude each other: rectification gives the calibration")
+    if rig is None and (ply is None) != (calibration is None):
         raise OptionError("--ply and --calibration go together, got only one of them")
+    if alpha is not None and rig is None:
+        raise OptionError("--alpha is for --rig")
     options = parse_settings(settings or [])
     flags = {"fill": fill, "weights": weights, "right": right and True, "confidence": confidence and True}
     options.update({name: value for name, value in flags.items() if value is not None})
@@ -110,6 +118,8 @@ def match(
         for name in ("--color", "--right", "--confidence", "--ply"):
             if name in outputs:
                 raise OptionError(f"{name} is not available with --memory and --overlap")
+        if rig is not None:
+            raise OptionError("--rig is not available with --memory and --overlap; stereokit rectify comes before them")
         from stereokit.cli.match_large import match_in_windows
 
         content, table = match_in_windows(
@@ -127,13 +137,18 @@ def match(
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
         raise InputError(f"LEFT and RIGHT must have the same size, got {sizes}")
     camera = _read_camera(calibration, cameras, width, height)
+    masks: dict[str, NDArray[Any]] = {}
+    if rig is not None:
+        rectification = read_rig_option(rig, (width, height)).rectification(alpha=alpha)
+        images, masks, camera = rectification(*images), rectification.masks, rectification.calibration
+        width, height = rectification.size
 
     with waiting("Matching (the first run also compiles) ..."):
         blanks = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
         with collecting():
             matcher(*blanks)  # compiles, so that the time below is that of matching
         start = time.perf_counter()
-        result = matcher(*images)
+        result = matcher(*images, **masks)
         seconds = time.perf_counter() - start
 
     result.save(output, clip=True)  # its range was checked; a refiner may add a pixel
@@ -153,6 +168,7 @@ def match(
         "height": height,
         **matcher_report(matcher),
         "options": options,
+        **({} if rig is None else {"rig": rig, "alpha": alpha}),
         "density": result.density,
         "seconds": seconds,
         "version": version_of("stereokit"),

@@ -21,9 +21,10 @@ from stereokit.io import read_pair, write_disparity, write_image
 from stereokit.matching import Matcher
 from stereokit.notices import collecting
 from stereokit.result import colorize
+from stereokit.rig import Rectification, read_rig
 from stereokit_evaluation.batch.store import COLOR, make_below, publish, target_of
 
-__all__ = ["Job", "Outcome", "describe", "matcher_of", "work"]
+__all__ = ["Job", "Outcome", "describe", "matcher_of", "rectification_of", "work"]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -43,6 +44,10 @@ class Job:
     method : str
     options : tuple of (str, value)
         Of `stereokit.Matcher`.
+    rig : tuple of str
+        Files of raw cameras, absolute, with which the images are rectified first; empty for rectified pairs.
+    alpha : float or None
+        Of `stereokit.StereoRig.rectification`.
     """
 
     folder: str
@@ -50,6 +55,8 @@ class Job:
     color: bool
     method: str
     options: tuple[tuple[str, Any], ...]
+    rig: tuple[str, ...] = ()
+    alpha: float | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +113,11 @@ def work(job: Job, name: str, left: str | NDArray[Any], right: str | NDArray[Any
                 sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
                 raise InputError(f"left and right must have the same size, got {sizes}")
             matcher = matcher_of(job)
-            result = matcher(*images)
+            masks = {}
+            if job.rig:
+                rectification = rectification_of(job, (images[0].shape[1], images[0].shape[0]))
+                images, masks = rectification(*images), rectification.masks
+            result = matcher(*images, **masks)
         if job.color:  # before the map, whose existence means that the pair is complete
             picture = folder / COLOR / f"{name}.png"
             make_below(folder, *picture.parent.relative_to(folder).parts)
@@ -130,6 +141,7 @@ def describe(error: BaseException) -> str:
 
 
 _matchers: dict[Job, Matcher] = {}
+_rectifications: dict[tuple[Job, tuple[int, int]], Rectification] = {}
 _lock = threading.Lock()
 
 
@@ -142,3 +154,14 @@ def matcher_of(job: Job) -> Matcher:
             _matchers.clear()
             _matchers[job] = matcher
         return matcher
+
+
+def rectification_of(job: Job, size: tuple[int, int]) -> Rectification:
+    """Return what rectifies the job's images of a size, pixels; the last one is kept."""
+    with _lock:
+        rectification = _rectifications.get((job, size))
+        if rectification is None:
+            rectification = read_rig(*job.rig, size=size).rectification(alpha=job.alpha)
+            _rectifications.clear()
+            _rectifications[job, size] = rectification
+        return rectification

@@ -17,6 +17,7 @@ import numpy as np
 
 import stereokit
 from stereokit.errors import StereokitError
+from stereokit.io.calibrations.dispatch import digest
 from stereokit.kernels.threads import available_threads
 from stereokit.notices import collecting
 from stereokit_evaluation.batch.job import Job, Outcome, matcher_of, work
@@ -113,6 +114,7 @@ def identity(job: Job, inputs: Any) -> dict[str, Any]:
         **matcher.identity(),
         "format": job.suffix,
         "color": job.color,
+        **({"rig": digest(job.rig), "alpha": job.alpha} if job.rig else {}),
         "version": stereokit.__version__,
     }
 

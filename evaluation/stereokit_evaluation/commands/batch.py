@@ -35,6 +35,7 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.cli.output import Table
+from stereokit.cli.rig import AlphaOption, RigOption, rig_files
 from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES
@@ -66,6 +67,8 @@ def batch(
     settings: SettingsOption = None,
     file_format: Annotated[str, typer.Option("--format", help="png (KITTI), pfm, npy or tiff.")] = "png",
     color: Annotated[bool, typer.Option("--color", help="Also coloured pictures, in DIR/color.")] = False,
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     pattern: Annotated[
         tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Files of a folder, '*_l.png' '*_r.png'.")
     ] = None,
@@ -80,6 +83,7 @@ def batch(
     A folder has left and right, or image_2 and image_3, or files NAME_left and NAME_right, or others by --pattern; a
     list has lines left,right[,name]; a video has both views side by side, or is two files. Existing maps stay,
     and must come from the same inputs and options. Pairs that fail are named, and the exit status is then 1.
+    With --rig the images are raw ones, and are rectified first.
     """
     check_json(json_file)
     if file_format not in _FORMATS:
@@ -99,7 +103,10 @@ def batch(
     if weights is not None and weights.endswith(".safetensors"):
         options["weights"] = os.path.abspath(weights)
     folder = os.path.abspath(output)
-    job = Job(folder, f".{file_format}", color, method, tuple(sorted(options.items())))
+    if alpha is not None and rig is None:
+        raise OptionError("--alpha is for --rig")
+    raw = () if rig is None else tuple(os.path.abspath(path) for path in rig_files(rig))
+    job = Job(folder, f".{file_format}", color, method, tuple(sorted(options.items())), raw, alpha)
     matcher_of(job)  # refuses bad options
     run_on, engine_options, client = _engine(engine, scheduler, workers)
     try:

@@ -23,6 +23,7 @@ from stereokit.cli.options import (
     parse_settings,
     write_json,
 )
+from stereokit.cli.rig import AlphaOption, RigOption, read_rig_option
 from stereokit.errors import InputError, OptionError
 from stereokit.io import check_output, read_disparity, read_pair, write_bytes
 from stereokit_evaluation.common.weights import check_weights, weights_option
@@ -50,22 +51,29 @@ def view(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage; may repeat.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Middlebury, KITTI or JSON calibration, for metres.")
+        Path | None, typer.Option(metavar="FILE", help="Calibration of a rectified pair, for metres.")
     ] = None,
     cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     truth: Annotated[Path | None, typer.Option(metavar="FILE", help="True disparity, for errors.")] = None,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Match LEFT and RIGHT and write a page with image, disparity, error and point cloud.
 
-    Without a calibration there is no depth, and the point cloud is in pixels.
+    Without a calibration there is no depth, and the point cloud is in pixels. With --rig the images are raw ones, and
+    are rectified first.
     """
     check_output(output, (".html", ".htm"), "output")
     check_json(json_file)
     require("jinja2")
     if refiner and scale == 1:
         raise OptionError(f"refiner needs --scale 0.5, got {', '.join(refiner)} with scale 1")
+    if rig is not None and calibration is not None:
+        raise OptionError("--rig and --calibration exclude each other: rectification gives the calibration")
+    if alpha is not None and rig is None:
+        raise OptionError("--alpha is for --rig")
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
     options |= {"threads": threads, "device": device, **parse_settings(settings or ())}
     names = list(dict.fromkeys(method or ["S2"]))
@@ -84,14 +92,18 @@ def view(
         raise InputError(f"LEFT and RIGHT must have the same size and number of channels, got {sizes}")
     size = images[0].shape[1], images[0].shape[0]
     camera = None if calibration is None else read_calibration(calibration, cameras, size)
+    masks: dict[str, Any] = {}
+    if rig is not None:
+        rectification = read_rig_option(rig, size).rectification(alpha=alpha)
+        images, masks, camera = rectification(*images), rectification.masks, rectification.calibration
     true_disparity = None if truth is None else read_disparity(truth)
     if true_disparity is not None and true_disparity.shape != images[0].shape[:2]:
         raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {true_disparity.shape}")
     maps, seconds = [], {}
     for name, matcher in matchers.items():
-        matcher(*images)  # compiles, so that the time below is that of matching
+        matcher(*images, **masks)  # compiles, so that the time below is that of matching
         start = time.perf_counter()
-        result = matcher(*images)
+        result = matcher(*images, **masks)
         seconds[name] = time.perf_counter() - start
         note = f"{1000 * seconds[name]:.0f} ms"
         if true_disparity is not None:

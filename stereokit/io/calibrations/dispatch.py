@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from stereokit.io.calibrations.trees import from_json, from_xml, from_yaml
 from stereokit.io.calibrations.zed import from_zed
 from stereokit.io.reading import parsing, read_text
 
-__all__ = ["KNOWN", "name_of", "read_content"]
+__all__ = ["KNOWN", "digest", "name_of", "read_content"]
 
 KNOWN = (
     "known are OpenCV's YAML, XML and JSON (K1 D1 K2 D2 R T, P1 P2 or Q), ROS camera_info (left.yaml and right.yaml), "
@@ -71,6 +72,18 @@ def read_content(
     texts = [_text(path) for path in files]
     with parsing(name_of(files), "calibration"):
         return _parsed(files, texts, cameras, size)
+
+
+def digest(paths: Sequence[str | os.PathLike[str]]) -> str:
+    """Return what identifies the content of a calibration of one file or two, or of a folder.
+
+    Raises
+    ------
+    FileError
+        If a file is missing or too large.
+    """
+    files = [part for path in paths for part in _in_folder(Path(path))]
+    return hashlib.sha256("\0".join(_text(path) for path in files).encode()).hexdigest()[:16]
 
 
 def name_of(paths: Sequence[str | os.PathLike[str]]) -> str:
@@ -130,7 +143,8 @@ def _of_text(text: str, cameras: tuple[int, int] | None, size: Size | None) -> C
         tree = from_json(text)
         if "intrinsic" in tree and "extrinsic" in tree and "baseline" in str(tree["extrinsic"]):
             return from_cityscapes(tree)
-        return None if known_keys(tree) and "fx" not in tree else from_fields(tree)
+        other = '"opencv-matrix"' in text or ("fx" not in tree and known_keys(tree))
+        return None if other else from_fields(tree)
     if re.match(_NUMBERS, start):
         return from_numbers(text)
     if re.search(r"^[ \t]*\[(LEFT|RIGHT)_CAM_\w+\]", text, re.MULTILINE | re.IGNORECASE):

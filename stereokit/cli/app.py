@@ -29,6 +29,7 @@ from typer.core import TyperGroup
 from stereokit.cli.info import info, list_
 from stereokit.cli.match import match
 from stereokit.cli.output import version_of
+from stereokit.cli.pair import check
 from stereokit.errors import StereokitError, one_line
 from stereokit.notices import collecting
 
@@ -135,6 +136,7 @@ def _root(
 
 
 app.command()(match)
+app.command()(check)
 app.command("list")(list_)
 app.command()(info)
 

@@ -1,9 +1,9 @@
 """Which pixels have something to say: masks of the user, black borders, and areas without texture.
 
 Pixels **without evidence** are those that a mask excludes, that hold no data, or that lie in a black border. They match
-nothing, are never measured and are not filled. **Blank** pixels are those of the left view in whose surroundings, as far
-as the cost looks, all pixels are equal: their cost is the same at all disparities, so that their neighbours decide on
-the value that they get, and they do not count as measured.
+nothing, are never measured and are not filled. **Blank** pixels are those of the left view in whose surroundings, as
+far as the cost looks, all pixels are equal: their cost is the same at all disparities, so that their neighbours decide
+on the value that they get, and they do not count as measured.
 
 A black border is what rectification leaves where no camera looked: zeros that hang together and reach a side of the
 image, at least `_SMALLEST_BORDER` of them and mostly thick. Of 224 views of streets, rooms and fields none has one.
@@ -98,7 +98,8 @@ def black_border(image: NDArray[Any]) -> NDArray[np.bool_] | None:
         return None
     chosen = np.zeros(len(found), np.bool_)
     chosen[at] = True
-    return chosen[labels]
+    border: NDArray[np.bool_] = chosen[labels]
+    return border
 
 
 def blank_pixels(gray: NDArray[Any], across: int, down: int) -> NDArray[np.bool_] | None:

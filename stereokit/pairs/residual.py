@@ -1,7 +1,7 @@
 """How far the rows of two views are apart, from a map that was measured: it needs no features, and a millisecond.
 
-At up to two hundred measured pixels, those with the steepest slopes down the image, the right view is taken where the map
-says, and the shift is looked for that makes it most like the left view: one step of Lucas and Kanade (1981) in both
+At up to two hundred measured pixels, those with the steepest slopes down the image, the right view is taken where the
+map says, and the shift is looked for that makes it most like the left view: one step of Lucas and Kanade (1981) in both
 directions. The median of the shifts down the rows is within a tenth of a pixel for offsets of up to half a pixel, and
 short of larger ones.
 """

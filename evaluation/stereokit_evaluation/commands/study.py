@@ -20,8 +20,7 @@ from stereokit.errors import OptionError
 from stereokit.io import check_output
 from stereokit.kernels.threads import available_threads
 from stereokit_evaluation.bench.baselines import HH, THREE_WAY, opencv_threads
-from stereokit_evaluation.bench.table import load as system_load
-from stereokit_evaluation.bench.table import machine, versions
+from stereokit_evaluation.bench.table import machine, system_load, versions
 from stereokit_evaluation.common.folders import check_folder, make_folder
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data.datasets import load_frames, select_frames

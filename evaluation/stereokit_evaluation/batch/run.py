@@ -133,7 +133,7 @@ def run_batch(
     Parameters
     ----------
     job : Job
-    source : list of Pair or Video
+    source : list of PairFiles or Video
     engine : callable
         `on_threads` or `stereokit_evaluation.batch.dask.on_cluster` with their options.
     inputs : str, or a list of them

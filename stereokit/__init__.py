@@ -21,6 +21,7 @@ from stereokit.matching import METHODS, Matcher, match, warmup
 from stereokit.notices import PairWarning
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
+from stereokit.rig import StereoRig, read_rig
 from stereokit.selection import select
 from stereokit.stages import aggregate, cost_volume
 
@@ -40,6 +41,7 @@ __all__ = [
     "OptionError",
     "PairWarning",
     "RowCost",
+    "StereoRig",
     "StereokitError",
     "StereokitWarning",
     "UnknownNameError",
@@ -51,6 +53,7 @@ __all__ = [
     "match_large",
     "read_disparity",
     "read_image",
+    "read_rig",
     "select",
     "warmup",
     "write_disparity",

@@ -525,6 +525,7 @@ def skewed(k):
 
 
 WRONG = {
+    "omnidirectional": ({"xi1": np.array([[2.5]])}, "omnidirectional one .it has xi"),
     "skew": ({"K1": skewed(K1)}, r"k1 must be of a camera without skew, got a skew of 12"),
     "rotation": ({"R": R * 1.1}, r"rotation \(R\) must be a rotation matrix"),
     "mirrored": ({"R": np.diag([1.0, 1, -1])}, "must be a rotation matrix"),

@@ -18,14 +18,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereokit.errors import FileError, InputError, OptionError
+from stereokit.errors import FileError, InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.io import parsing
 from stereokit.io.calibrations import Content, check_projections, read_content
 from stereokit.io.calibrations.dispatch import name_of
 from stereokit.io.calibrations.units import in_metres
 from stereokit.notices import warn
 
-__all__ = ["Calibration", "read_calibration"]
+__all__ = ["FRAMES", "Calibration", "read_calibration"]
+
+FRAMES = {
+    "optical": "x right, y down, z forward",
+    "y-up": "x right, y up, z backward",
+    "ros": "x forward, y left, z up",
+}
+"""Frames of points, and their axes: that of images and OpenCV; that of OpenGL, in which viewers show the scene upright;
+and that of the body of a ROS robot (REP 103)."""
 
 
 @dataclass(frozen=True)
@@ -122,13 +130,15 @@ class Calibration:
         depth[np.isinf(depth)] = np.nan
         return depth
 
-    def points(self, disparity: ArrayLike) -> NDArray[np.float32]:
-        """Return the point of every pixel in the left camera's frame: x right, y down, z forward.
+    def points(self, disparity: ArrayLike, frame: str = "optical") -> NDArray[np.float32]:
+        """Return the point of every pixel in a frame of the left camera.
 
         Parameters
         ----------
         disparity : (H, W) float
             Pixels, not finite where invalid.
+        frame : {"optical", "y-up", "ros"}
+            The axes, see `FRAMES`: x right, y down, z forward; x right, y up, z backward; x forward, y left, z up.
 
         Returns
         -------
@@ -139,13 +149,21 @@ class Calibration:
         ------
         InputError
             If `disparity` is not a 2-d array of floats or has another size than the calibration.
+        UnknownNameError
+            If there is no such frame.
         """
+        if not isinstance(frame, str) or frame not in FRAMES:
+            raise UnknownNameError(did_you_mean("frame", frame, FRAMES))
         depth = self.disparity_to_depth(disparity)
         height, width = depth.shape
         points = np.empty((height, width, 3), np.float32)
         points[..., 0] = depth * ((np.arange(width) - self.cx0) / self.fx).astype(np.float32)
         points[..., 1] = depth * ((np.arange(height) - self.cy) / self.fy).astype(np.float32)[:, None]
         points[..., 2] = depth
+        if frame == "y-up":
+            points[..., 1:] *= -1
+        elif frame == "ros":
+            points = np.stack([points[..., 2], -points[..., 0], -points[..., 1]], axis=-1)
         return points
 
     def scaled(self, factor: float) -> Calibration:

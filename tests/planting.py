@@ -1,4 +1,4 @@
-"""Flaws for mutation tests: a piece of code, found by its shape, and the code that takes its place.
+"""Flaws for mutation tests: a pattern of code, and the code that takes its place.
 
 A pattern is Python code, an expression or statements. It matches code of the same shape, whatever the names of local
 variables, the line breaks and the comments are: each local variable of the pattern stands for one local variable of
@@ -63,6 +63,8 @@ def flawed(source: str, mutant: Mutant) -> ast.Module:
     """
     tree = ast.parse(source)
     old, new = _code(mutant.old), _code(mutant.new)
+    if isinstance(new, list) and not isinstance(old, list):
+        old = [ast.Expr(old)]
     matches = list(_matches(tree, old, mutant.function))
     if len(matches) != 1:
         raise StaleMutant(f"old code must match once in {mutant.module}, got {len(matches)} times: {mutant.old!r}")
@@ -137,8 +139,8 @@ def _same(pattern: Any, code: Any, names: dict[str, Any], local: frozenset[str])
         return isinstance(code, list) and _same_lists(pattern, code, names, local)
     if isinstance(pattern, ast.Name):
         if re.fullmatch(r"_\d", pattern.id):
-            held = names.setdefault(pattern.id, code)
-            return isinstance(code, ast.expr) and ast.dump(held) == ast.dump(code)
+            meaning = names.setdefault(pattern.id, code)
+            return isinstance(code, ast.expr) and ast.dump(meaning) == ast.dump(code)
         if not isinstance(code, ast.Name):
             return False
         if code.id not in local:

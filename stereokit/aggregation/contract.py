@@ -58,7 +58,7 @@ class Aggregation(Protocol):
         threads : int
             Threads to use; the result must not depend on it.
         out : SelectionOutput
-            Where `stereokit.selection.wta.select_row` writes.
+            Maps that `stereokit.selection.wta.select_row` writes.
         total : (H, W, P) of `total_dtype`, optional
-            Where the aggregated costs go, if they are wanted.
+            Volume for the aggregated costs, if they are wanted.
         """

@@ -91,7 +91,7 @@ class Dt:
     passes : int
         Passes N over the image (``rf``), 1 to 5.
     mode : {"rf", "sum"}
-        Which of the two published forms.
+        One of the two published forms.
     """
 
     sigma_s: float = 20.0

@@ -59,7 +59,7 @@ class Sgm:
         Grey difference of two neighbours, in levels of 0..255, from which the penalties of the step between them
         are lower: disparity jumps where the image does (Hirschmueller 2008, section II-B, in two levels).
     edge_factor : float
-        What the penalties are multiplied by there, 0 to 1; 1 for penalties that do not follow the image.
+        Factor of the penalties there, 0 to 1; 1 for penalties that do not follow the image.
     """
 
     p1: float | None = None
@@ -130,9 +130,9 @@ class Sgm:
         threads : int
             1 or more; two are used.
         out : SelectionOutput
-            Where the selection goes.
+            Maps of the selection.
         total : (H, W, P) uint16 or None
-            Where the sums over all paths go, if they are wanted.
+            Volume for the sums over all paths, if they are wanted.
         """
         height = guide.shape[0]
         key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.costly_to_recompute

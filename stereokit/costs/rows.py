@@ -4,7 +4,7 @@ A cost is a *producer of rows*. It prepares an image pair once and returns, for 
 arrays; `cost_row` then writes the costs of row `y`, ``(W, P)`` ``uint8``, disparity innermost, when a sweep asks
 for it. Costs are cheap to compute again, so the cost volume is never stored.
 
-Which code `cost_row` runs is decided by the *type* of the named tuple when a sweep is compiled (see
+The *type* of the named tuple decides, when a sweep is compiled, which code `cost_row` runs (see
 `implements`): two producers times two sweeps are four specialisations of one source, and a third cost is one
 more file.
 
@@ -77,11 +77,11 @@ class CostInput:
         Pixels that were NaN or infinite and carry no evidence; None when there are none.
     levels : Levels
         Disparities to try.
-    outside : float or None
+    border_share : float or None
         Cost of a level whose right pixel lies outside the image, as a share of the cost's range; None takes
         the nearest border pixel instead.
     threads : int
-        How many threads preparation may use.
+        Threads that preparation may use.
     ranges : ((int, int), (int, int)) or None
         Smallest and largest value of the left and of the right image, where these are windows of larger ones; None
         where they are whole.
@@ -92,7 +92,7 @@ class CostInput:
     left_bad: NDArray[np.bool_] | None
     right_bad: NDArray[np.bool_] | None
     levels: Levels
-    outside: float | None
+    border_share: float | None
     threads: int = 1
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
@@ -136,7 +136,7 @@ def takes_8_bits(cost: Any) -> bool:
 
 
 class CellMask(NamedTuple):
-    """Which cells of a row of costs have no evidence (flat arrays, for kernels)."""
+    """Cells of a row of costs that have no evidence (flat arrays, for kernels)."""
 
     width: int
     blocks: tuple[int, ...]  # one element per 64 levels: its length is known to the compiler
@@ -175,21 +175,21 @@ def cell_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
     """Return the cells of `pair` without evidence, for costs of ``0..cost_max``; cached where no pixel is invalid."""
     if pair.left_bad is not None or pair.right_bad is not None:
         return _new_mask(pair, cost_max, Workspace())
-    key = pair.left.shape, pair.levels, pair.outside, cost_max
+    key = pair.left.shape, pair.levels, pair.border_share, cost_max
     return workspace.cached("cells", key, lambda: _new_mask(pair, cost_max, Workspace()))
 
 
 def _new_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
     height, width = pair.left.shape
     levels = pair.levels
-    border_cost = np.uint8(cost_max if pair.outside is None else round(pair.outside * cost_max))
+    border_cost = np.uint8(cost_max if pair.border_share is None else round(pair.border_share * cost_max))
     stride = width + levels.padded
     shared = pair.right_bad is None
     low = workspace.array("cells.low", (1 if shared else height, stride), np.uint8)
     high = workspace.array("cells.high", low.shape, np.uint8)
     columns = width - 1 - levels.minimum - np.arange(stride)
     inside = (columns >= 0) & (columns < width)
-    evidence = np.broadcast_to(inside | (pair.outside is None), low.shape)
+    evidence = np.broadcast_to(inside | (pair.border_share is None), low.shape)
     if pair.right_bad is not None:
         evidence = evidence & ~pair.right_bad[:, np.clip(columns, 0, width - 1)]
     low[...] = np.where(evidence, 0, border_cost)

@@ -40,7 +40,7 @@ def post_process(
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
         As selected; overwritten, and returned where there is no median.
     cost : (H * W,) uint16 or float32
@@ -48,7 +48,7 @@ def post_process(
     bad : (H * W,) uint8 or None
         1 where a pixel has no evidence.
     chain : PostProcessing
-        What to do.
+        Options.
     shape : (int, int)
         Height and width, pixels.
 

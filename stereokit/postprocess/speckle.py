@@ -34,7 +34,7 @@ def remove_speckles(
     size : int
         Largest region that is removed, pixels.
     difference : float
-        How much neighbours of one region differ at most, pixels.
+        Largest difference of neighbours in one region, pixels.
     threads : int
         Threads to use; the result does not depend on it.
     workspace : Workspace or None

@@ -31,7 +31,7 @@ def _same(function: Any) -> Any:
 
 
 def _kind_of(value: Any) -> Any:
-    """Return what the choice of a helper by types asks of a type."""
+    """Return a stand-in for the type of a value, with the attributes that helpers choose by."""
     if isinstance(value, lanes.Lanes):
         return SimpleNamespace(scalar=value.scalar)
     if isinstance(value, np.ndarray):

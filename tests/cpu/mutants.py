@@ -27,7 +27,7 @@ OUTCOMES = {
     _BORDER: "wrong result",
     _RULE: "wrong result",
 }
-"""How a mutant of each kind is caught."""
+"""Outcome of the check on a mutant of each kind."""
 
 MUTANTS = [
     # ------------------------------------------------------------------ penalties
@@ -283,7 +283,7 @@ MUTANTS = [
 
 
 def how_caught(mutant: Mutant | None, check: str = "") -> str:
-    """Return how a check fails on the mutant, a value of `OUTCOMES`; "" if it passes.
+    """Return the outcome of the check on the mutant, a value of `OUTCOMES`; "" if it passes.
 
     Any other exception is an error of the mutant, never a catch, and passes through.
     """

@@ -238,8 +238,8 @@ def test_what_contradicts_itself_is_refused(tmp_path, text, message):
 def test_what_differs_by_rounding_is_taken(tmp_path):
     path = tmp_path / "calib.txt"
     path.write_text(LEFT + RIGHT.replace("700 0", "700.3 0.2").replace("80", "80.4") + "doffs=40.3\nbaseline=120\n")
-    found = read_calibration(path)
-    assert (found.fx, found.cy, found.doffs) == (700, 80, pytest.approx(40.3))
+    calibration = read_calibration(path)
+    assert (calibration.fx, calibration.cy, calibration.doffs) == (700, 80, pytest.approx(40.3))
 
 
 @pytest.mark.parametrize("change", [lambda b: b"\xef\xbb\xbf" + b, lambda b: b.replace(b"\n", b"\r\n")])

@@ -219,7 +219,7 @@ def flat(values):
 
 def ros(side, unit=1.0, model="plumb_bob", d=None):
     k, coefficients, n = (K1, D1, 1) if side == "left" else (K2, D2, 2)
-    made = rectified_cameras(unit)
+    rectified = rectified_cameras(unit)
     coefficients = coefficients if d is None else d
     return f"""image_width: {WIDTH}
 image_height: {HEIGHT}
@@ -236,11 +236,11 @@ distortion_coefficients:
 rectification_matrix:
   rows: 3
   cols: 3
-  data: {flat(made[f"R{n}"])}
+  data: {flat(rectified[f"R{n}"])}
 projection_matrix:
   rows: 3
   cols: 4
-  data: {flat(made[f"P{n}"])}
+  data: {flat(rectified[f"P{n}"])}
 """
 
 
@@ -263,11 +263,11 @@ def test_ros_camera_info(tmp_path):
 
 
 def test_ros_messages_as_they_are_printed(tmp_path):
-    made = rectified_cameras()
+    rectified = rectified_cameras()
     for upper in (False, True):
         for n, (side, k, d) in enumerate((("left", K1, D1), ("right", K2, D2)), start=1):
             names = [name.upper() if upper else name for name in "kdrp"]
-            values = dict(zip(names, (k, d, made[f"R{n}"], made[f"P{n}"]), strict=True))
+            values = dict(zip(names, (k, d, rectified[f"R{n}"], rectified[f"P{n}"]), strict=True))
             lines = ["header:", "  stamp:", "    sec: 1", "  frame_id: camera", "height: 480", "width: 640",
                      "distortion_model: plumb_bob"]  # fmt: skip
             for name, value in values.items():
@@ -403,18 +403,22 @@ def test_zed(tmp_path):
 def test_kitti_with_its_raw_cameras(tmp_path):
     """Cameras 2 and 3 stand anywhere to camera 0: what counts is how 3 stands to 2."""
     second = pose(cv2.Rodrigues(np.array([0.004, -0.02, 0.01]))[0], (0.06, 0.001, 0.002))
-    made = rectified_cameras()
+    rectified = rectified_cameras()
     lines = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.95e-02"]
     for n, k, d, place in ((2, K1, D1, second), (3, K2, D2, pose() @ second)):
         for name, value in (("S", (640, 480)), ("K", k), ("D", d), ("R", place[:3, :3]), ("T", place[:3, 3])):
             lines.append(f"{name}_{n:02d}: " + " ".join(f"{v:.15e}" for v in np.ravel(value)))
-        for name, value in (("S_rect", (640, 480)), ("R_rect", made[f"R{n - 1}"]), ("P_rect", made[f"P{n - 1}"])):
+        for name, value in (
+            ("S_rect", (640, 480)),
+            ("R_rect", rectified[f"R{n - 1}"]),
+            ("P_rect", rectified[f"P{n - 1}"]),
+        ):
             lines.append(f"{name}_{n:02d}: " + " ".join(f"{v:.15e}" for v in np.ravel(value)))
     path = tmp_path / "calib_cam_to_cam.txt"
     path.write_text("\n".join(lines) + "\n")
     rig = read_rig(path)
     check(rig, atol=1e-12)
-    assert rig.rectified().fx == pytest.approx(made["P1"][0, 0])
+    assert rig.rectified().fx == pytest.approx(rectified["P1"][0, 0])
 
 
 RECTIFIED = {
@@ -553,17 +557,17 @@ def test_what_contradicts_itself_is_refused_by_name(tmp_path, name):
 
 def test_rectified_cameras_that_contradict_the_rest_are_refused(tmp_path):
     path = tmp_path / "stereo.yml"
-    made = rectified_cameras()
+    rectified = rectified_cameras()
     for change, words in (
         (
-            {"P2": made["P2"] * [[1, 1, 1, 1.5], [1] * 4, [1] * 4]},
+            {"P2": rectified["P2"] * [[1, 1, 1, 1.5], [1] * 4, [1] * 4]},
             "T is 0.12.* long, but p1 and p2 have a baseline of 0.18",
         ),
-        ({"P2": made["P2"] * [[1, 1, 1, -1], [1] * 4, [1] * 4]}, "p2 must lie to the right of p1.*exchanged"),
-        ({"P2": made["P2"] * [[1.1, 1, 1, 1.1], [1] * 4, [1] * 4]}, "p1 and p2 must share fx, as rectified"),
-        ({"P2": made["P2"] + [[0] * 4, [0, 0, 3, 0], [0] * 4]}, "p1 and p2 must share cy, as rectified"),
+        ({"P2": rectified["P2"] * [[1, 1, 1, -1], [1] * 4, [1] * 4]}, "p2 must lie to the right of p1.*exchanged"),
+        ({"P2": rectified["P2"] * [[1.1, 1, 1, 1.1], [1] * 4, [1] * 4]}, "p1 and p2 must share fx, as rectified"),
+        ({"P2": rectified["P2"] + [[0] * 4, [0, 0, 3, 0], [0] * 4]}, "p1 and p2 must share cy, as rectified"),
     ):
-        path.write_text(opencv(".yml", {**basic(), **made, **change}))
+        path.write_text(opencv(".yml", {**basic(), **rectified, **change}))
         with pytest.raises(FileError, match=words):
             read_rig(path)
 

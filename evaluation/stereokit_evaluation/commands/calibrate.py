@@ -22,7 +22,7 @@ from stereokit.io import check_output, write_image
 from stereokit.rig.boards import Board, parse_length
 from stereokit.rig.calibrate import BoardCalibration, PairQuality, rectification_of, rows_picture
 from stereokit.rig.calibrate import calibrate as calibrate_pairs
-from stereokit_evaluation.batch.pairs import Pair
+from stereokit_evaluation.batch.pairs import PairFiles
 from stereokit_evaluation.batch.video import Video
 from stereokit_evaluation.commands.batch import find_pairs
 from stereokit_evaluation.commands.rectify import images_of
@@ -87,10 +87,10 @@ def _board(text: str, square: str, marker: str | None, dictionary: str) -> Board
 
 
 def _pairs(
-    source: list[Pair] | Video, every: int, unread: list[PairQuality], step: Any
+    source: list[PairFiles] | Video, every: int, unread: list[PairQuality], step: Any
 ) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
     """Yield each so-many-th pair that can be read; the others are told."""
-    chosen: list[Pair] | Video = source if isinstance(source, Video) else source[::every]
+    chosen: list[PairFiles] | Video = source if isinstance(source, Video) else source[::every]
     for number, (name, images, reason) in enumerate(images_of(chosen)):
         if isinstance(source, Video) and number % every:
             continue
@@ -101,7 +101,7 @@ def _pairs(
         step("", 1)
 
 
-def _draw(source: list[Pair] | Video, calibration: BoardCalibration, picture: Path) -> None:
+def _draw(source: list[PairFiles] | Video, calibration: BoardCalibration, picture: Path) -> None:
     """Write the pair whose rows differ most, of those that were used."""
     used = [pair for pair in calibration.pairs if not pair.reason]
     worst = max(used, key=lambda pair: pair.epipolar_px or 0.0).name
@@ -126,7 +126,7 @@ def _content(calibration: BoardCalibration, output: Path, picture: Path) -> dict
 
 
 def _show(calibration: BoardCalibration, output: Path, picture: Path) -> None:
-    table = Table("Pair", "Reprojection, px", "Rows, px", "Left out because", box=SIMPLE_HEAD, pad_edge=False)
+    table = Table("PairFiles", "Reprojection, px", "Rows, px", "Left out because", box=SIMPLE_HEAD, pad_edge=False)
     for pair in calibration.pairs:
         errors = ("" if e is None else f"{e:.3f}" for e in (pair.reprojection_px, pair.epipolar_px))
         table.add_row(pair.name, *errors, pair.reason)

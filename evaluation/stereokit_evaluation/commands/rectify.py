@@ -18,7 +18,7 @@ from stereokit.errors import InputError, OptionError, StereokitError, one_line
 from stereokit.io import IMAGE_SUFFIXES, READABLE_SUFFIXES, make_folder, read_pair, write_bytes, write_image
 from stereokit.rig import Rectification
 from stereokit.rig.calibrate import rows_picture
-from stereokit_evaluation.batch.pairs import Pair
+from stereokit_evaluation.batch.pairs import PairFiles
 from stereokit_evaluation.batch.video import Video
 from stereokit_evaluation.commands.batch import find_pairs
 from stereokit_evaluation.common.progress import progress
@@ -101,7 +101,7 @@ def rectify(
         raise typer.Exit(1)
 
 
-def raw_pairs(inputs: list[Path], pattern: tuple[str, str] | None = None) -> list[Pair] | Video:
+def raw_pairs(inputs: list[Path], pattern: tuple[str, str] | None = None) -> list[PairFiles] | Video:
     """Return the pairs of the inputs: two images, or what `stereokit batch` takes.
 
     Raises
@@ -112,12 +112,12 @@ def raw_pairs(inputs: list[Path], pattern: tuple[str, str] | None = None) -> lis
         If the inputs do not go together.
     """
     if len(inputs) == 2 and all(path.suffix.lower() in READABLE_SUFFIXES and path.is_file() for path in inputs):
-        return [Pair(inputs[0].stem, str(inputs[0]), str(inputs[1]))]
+        return [PairFiles(inputs[0].stem, str(inputs[0]), str(inputs[1]))]
     return find_pairs(inputs, pattern)[0]
 
 
 def images_of(
-    source: list[Pair] | Video,
+    source: list[PairFiles] | Video,
 ) -> Iterator[tuple[str, tuple[NDArray[Any], NDArray[Any]] | None, str]]:
     """Yield name and images of each pair, None and the reason where there are none."""
     for pair in source.frames() if isinstance(source, Video) else source:

@@ -60,7 +60,7 @@ def view(
     open_browser: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Match LEFT and RIGHT and write a page to look at: image, disparity, error, point cloud.
+    """Match LEFT and RIGHT and write a page with image, disparity, error and point cloud.
 
     Without a calibration there is no depth, and the point cloud is in pixels. With --rig the images are raw ones, and
     are rectified first.
@@ -80,11 +80,11 @@ def view(
     check_weights(refiner or (), weights)
     refiners: list[str | None] = [*refiner] if refiner else [None]
     matchers = {
-        f"{name} {title(refine or 'linear') if scale != 1 else ''}".strip(): Matcher(
-            name, refiner=refine, **options, **weights_option(refine, weights)
+        f"{name} {title(refiner_name or 'linear') if scale != 1 else ''}".strip(): Matcher(
+            name, refiner=refiner_name, **options, **weights_option(refiner_name, weights)
         )
         for name in names
-        for refine in refiners
+        for refiner_name in refiners
     }
     images = read_pair(left, right)
     if images[0].shape != images[1].shape:
@@ -96,21 +96,21 @@ def view(
     if rig is not None:
         rectification = read_rig_option(rig, size).rectification(alpha=alpha)
         images, masks, camera = rectification(*images), rectification.masks, rectification.calibration
-    known = None if truth is None else read_disparity(truth)
-    if known is not None and known.shape != images[0].shape[:2]:
-        raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {known.shape}")
+    true_disparity = None if truth is None else read_disparity(truth)
+    if true_disparity is not None and true_disparity.shape != images[0].shape[:2]:
+        raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {true_disparity.shape}")
     maps, seconds = [], {}
     for name, matcher in matchers.items():
         matcher(*images, **masks)  # compiles, so that the time below is that of matching
-        begun = time.perf_counter()
-        found = matcher(*images, **masks)
-        seconds[name] = time.perf_counter() - begun
+        start = time.perf_counter()
+        result = matcher(*images, **masks)
+        seconds[name] = time.perf_counter() - start
         note = f"{1000 * seconds[name]:.0f} ms"
-        if known is not None:
-            d1 = score(found.disparity, occ=known, measured=found.valid).occ.all.filled.d1()
+        if true_disparity is not None:
+            d1 = score(result.disparity, occ=true_disparity, measured=result.valid).occ.all.filled.d1()
             note += "" if d1 is None else f", D1 {d1:.2f} %"
-        maps.append(viewer.Shown(name, found.disparity, found.valid, note))
-    pair = viewer.pair(left.name, images[0], maps, occ=known, calibration=camera)
+        maps.append(viewer.MethodMap(name, result.disparity, result.valid, note))
+    pair = viewer.pair(left.name, images[0], maps, occ=true_disparity, calibration=camera)
     page = render(
         "view.html.j2", [pair], title=_title(left, right), version=__version__,
         maps=maps, methods=[maps[0].name, maps[-1].name],
@@ -122,8 +122,8 @@ def view(
         "density": {shown.name: float(np.mean(shown.valid)) for shown in maps}, "version": __version__,
     }  # fmt: skip
     if not write_json(json_file, report):
-        without = "" if camera is not None else "; no calibration: no depth, and the point cloud is in pixels"
-        typer.echo(f"{output} ({len(page) / 1e6:.1f} MB){without}")
+        hint = "" if camera is not None else "; no calibration: no depth, and the point cloud is in pixels"
+        typer.echo(f"{output} ({len(page) / 1e6:.1f} MB){hint}")
     if open_browser:
         webbrowser.open(output.resolve().as_uri())
 

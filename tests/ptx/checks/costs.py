@@ -8,7 +8,7 @@ import numpy as np
 
 from stereokit.costs import Census, Zncc, census_cuda, zncc_cuda
 from stereokit.costs.rows import CostInput, Levels, produce_volume
-from stereokit.costs.rows_cuda import Scene
+from stereokit.costs.rows_cuda import DevicePair
 from stereokit.kernels.workspace import Workspace
 
 SIZES: list[tuple[tuple[int, int], Levels, float | None]] = [
@@ -34,11 +34,11 @@ def check_volume(
     want = produce_volume(rows, shape, levels, 1)
     images = queue.upload("images", np.stack([left, right]))
     known = queue.upload("bad", bad.view(np.uint8)) if masked else queue.array("bad", 1, np.uint8)
-    scene = Scene(images, np.dtype(dtype), known, masked, *shape, levels, outside, ranges)
+    pair = DevicePair(images, np.dtype(dtype), known, masked, *shape, levels, outside, ranges)
     module = census_cuda if isinstance(cost, Census) else zncc_cuda
-    found = queue.fetch(queue.view(module.volume(queue, cost, scene), np.uint8)).reshape(*shape, scene.padded)
-    np.testing.assert_array_equal(found[:, :, : levels.count], want)
-    assert (found[:, :, levels.count :] == 255).all()
+    costs = queue.fetch(queue.view(module.volume(queue, cost, pair), np.uint8)).reshape(*shape, pair.padded)
+    np.testing.assert_array_equal(costs[:, :, : levels.count], want)
+    assert (costs[:, :, levels.count :] == 255).all()
 
 
 def check_census(queue):

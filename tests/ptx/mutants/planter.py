@@ -1,4 +1,4 @@
-"""Puts a flawed copy of a module in the place of the real one, in memory, and asks a check whether it sees the flaw.
+"""A flawed copy of a module takes the place of the real one, in memory, and a check is asked whether it sees the flaw.
 
 Modules that import the flawed one, directly or through others, are imported anew while the flaw lasts, and so are the
 checks, so that kernels and the host code that launches them are those of the flawed module. Everything else stays:
@@ -14,18 +14,19 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ptx import harness
-from ptx.emulated import EmulatedQueue
-from ptx.errors import KernelError, UnknownInstruction
+from planting import Mutant, flawed
+
+from ptx.interpreter import harness
+from ptx.interpreter.emulated import EmulatedQueue
+from ptx.interpreter.errors import KernelError, UnknownInstruction
 from stereokit.cuda.kernel import KERNELS
 
-__all__ = ["SCHEDULES", "Mutant", "StaleMutant", "Uncompiled", "how_caught", "planted"]
+__all__ = ["SCHEDULES", "Uncompiled", "how_caught", "planted"]
 
 SCHEDULES = (None,)
 """Seeds of the queues that a check gets, in this order; a mutant is caught by the first that fails.
@@ -34,38 +35,8 @@ Lockstep finds them all: whether two accesses race does not depend on the order 
 """
 
 
-class StaleMutant(Exception):
-    """The text that a mutant replaces is not in its module, or is there more than once."""
-
-
 class Uncompiled(Exception):
     """A kernel of a mutant does not compile, or not to what the interpreter knows: no catch."""
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """A flaw.
-
-    Attributes
-    ----------
-    name : str
-        What it does.
-    module : str
-        Where, below ``stereokit``.
-    old, new : str
-        Text of the module, which must be there once, and what replaces it.
-    kind : str
-        The class of the bug.
-    check : str
-        What shall find it: ``post.check_smp`` is that function of ``ptx.bodies_post``.
-    """
-
-    name: str
-    module: str
-    old: str
-    new: str
-    kind: str
-    check: str
 
 
 class _Queue(EmulatedQueue):
@@ -80,31 +51,33 @@ class _Queue(EmulatedQueue):
 
 
 def how_caught(mutant: Mutant, **options: Any) -> str:
-    """Return how the check fails on the mutant, "wrong result" or a class of `ptx.errors` in words; "" if it passes.
+    """Return the failure of the check on the mutant, in words; "" if it passes.
+
+    It is "wrong result" or a class of `ptx.interpreter.errors` in words.
 
     Any other exception is an error of the mutant, never a catch, and passes through.
 
     Parameters
     ----------
     mutant : Mutant
-        The flaw. One whose old text and new text are equal shows whether the check passes on the real module.
+        The flaw; ``post.check_smp`` as its check is that function of `ptx.checks.post`. One whose old and new code are
+        equal shows whether the check passes on the real module.
     **options
         Further arguments of the check, such as sizes.
 
     Raises
     ------
     StaleMutant
-        If the old text does not occur exactly once.
+        If the old code does not match once.
     Uncompiled
         If a kernel does not compile.
     UnknownInstruction
         If the interpreter lacks an instruction.
     """
-    bodies, _, name = mutant.check.partition(".")
-    bodies = f"ptx.bodies_{bodies}"
-    importlib.import_module(bodies)
-    with planted(f"stereokit.{mutant.module}", mutant.old, mutant.new):
-        check = getattr(importlib.import_module(bodies), name)
+    checks, _, name = f"ptx.checks.{mutant.check}".rpartition(".")
+    importlib.import_module(checks)
+    with planted(mutant):
+        check = getattr(importlib.import_module(checks), name)
         for seed in SCHEDULES:
             try:
                 check(_Queue(seed), **options)
@@ -118,46 +91,38 @@ def how_caught(mutant: Mutant, **options: Any) -> str:
 
 
 @contextmanager
-def planted(module: str, old: str, new: str) -> Iterator[None]:
+def planted(mutant: Mutant) -> Iterator[None]:
     """Import a module with a flaw in it for a while.
-
-    Parameters
-    ----------
-    module : str
-        Name of the module.
-    old, new : str
-        Text that must be there once, and what replaces it.
 
     Raises
     ------
     StaleMutant
-        If `old` does not occur exactly once.
+        If the old code does not match once.
     """
+    module = f"stereokit.{mutant.module}"
     importlib.import_module(module)
     path = Path(str(sys.modules[module].__file__))
-    source = path.read_text(encoding="utf-8")
-    if source.count(old) != 1:
-        raise StaleMutant(f"old text must occur once in {module}, got {source.count(old)} times: {old!r}")
+    code = compile(flawed(path.read_text(encoding="utf-8"), mutant), f"<a mutant of {path}>", "exec", dont_inherit=True)
     names = _users(module)
-    kept = {name: sys.modules[name] for name in names}
-    filed = dict(KERNELS)
+    real_modules = {name: sys.modules[name] for name in names}
+    real_kernels = dict(KERNELS)
     try:
         _remove(names)
         for kernel in _kernels_of(names):
             del KERNELS[kernel.name]
-        _execute(module, path, source.replace(old, new))
+        _execute(module, path, code)
         yield
     finally:
         now = _users(module) | names  # and what was imported meanwhile
         _remove(now)
-        for name, real in kept.items():
+        for name, real in real_modules.items():
             _put(name, real)
         for kernel in _kernels_of(now):
-            if KERNELS.pop(kernel.name) is not filed.get(kernel.name):
+            if KERNELS.pop(kernel.name) is not real_kernels.get(kernel.name):
                 harness.forget(kernel)
-        others = {name: kernel for name, kernel in KERNELS.items() if name not in filed}
+        others = {name: kernel for name, kernel in KERNELS.items() if name not in real_kernels}
         KERNELS.clear()
-        KERNELS.update(filed | others)
+        KERNELS.update(real_kernels | others)
 
 
 def _kernels_of(modules: set[str]) -> list[Any]:
@@ -177,25 +142,25 @@ def _remove(names: set[str]) -> None:
         vars(sys.modules[parent]).pop(child, None)
 
 
-def _execute(name: str, path: Path, source: str) -> None:
-    made = ModuleType(name)
-    made.__file__ = str(path)
-    made.__package__ = name.rpartition(".")[0]
-    _put(name, made)
-    exec(compile(source, f"<a mutant of {path}>", "exec", dont_inherit=True), vars(made))
+def _execute(name: str, path: Path, code: Any) -> None:
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    module.__package__ = name.rpartition(".")[0]
+    _put(name, module)
+    exec(code, vars(module))
 
 
 def _users(module: str) -> set[str]:
     """Return a module and all loaded ones of the project and of the checks that import it when they are imported."""
-    found = {module}
+    users = {module}
     loaded = {
-        name: _imports(Path(str(held.__file__)))
-        for name, held in list(sys.modules.items())
-        if re.match(r"stereokit(\.|$)|ptx\.bodies_", name) and getattr(held, "__file__", None)
+        name: _imports(Path(str(entry.__file__)))
+        for name, entry in list(sys.modules.items())
+        if re.match(r"stereokit(\.|$)|ptx\.checks\.", name) and getattr(entry, "__file__", None)
     }
-    while more := {name for name, imports in loaded.items() if name not in found and imports & found}:
-        found |= more
-    return found
+    while more := {name for name, imports in loaded.items() if name not in users and imports & users}:
+        users |= more
+    return users
 
 
 @cache

@@ -28,14 +28,17 @@ def _compare(queue: Any, shape: tuple[int, int, int], largest: int, **options: A
     want = select(aggregate(volume, guide, "dt", cost=cost, **options), min_disparity=LOWEST)
 
     padded = 32 if levels <= 32 else 64 if levels <= 64 else -(-levels // 128) * 128
-    held = np.full((height, width, padded), 255, np.uint8)
-    held[:, :, :levels] = volume
+    padded_costs = np.full((height, width, padded), 255, np.uint8)
+    padded_costs[:, :, :levels] = volume
     kind = np.uint16 if dt.mode == "rf" else np.float32
-    found = [queue.array(f"test.{n}", height * width, dtype) for n, dtype in enumerate((np.float32, kind, np.float32))]
-    maps = Maps(*found, levels, LOWEST, 1, np.float32(0), 1)
-    costs, image = queue.upload("test.costs", held.reshape(-1).view(np.uint32)), queue.upload("test.guide", guide)
+    arrays = [queue.array(f"test.{n}", height * width, dtype) for n, dtype in enumerate((np.float32, kind, np.float32))]
+    maps = Maps(*arrays, levels, LOWEST, 1, np.float32(0), 1)
+    costs, image = (
+        queue.upload("test.costs", padded_costs.reshape(-1).view(np.uint32)),
+        queue.upload("test.guide", guide),
+    )
     aggregate_cuda(queue, dt, cost, costs, image, (height, width), padded, maps)
-    for out, expected in zip(found, want, strict=True):
+    for out, expected in zip(arrays, want, strict=True):
         np.testing.assert_array_equal(queue.fetch(out).reshape(height, width), expected)
 
 
@@ -66,9 +69,9 @@ def check_sum_in_bands(queue: Any, shapes: Any = ((3, 27, 40), (2, 16, 130))) ->
 
 
 def _in_bands(bytes_: int, *arguments: Any, **options: Any) -> None:
-    kept = _lines_cuda.BAND_BYTES
+    whole = _lines_cuda.BAND_BYTES
     _lines_cuda.BAND_BYTES = bytes_
     try:
         _compare(*arguments, **options)
     finally:
-        _lines_cuda.BAND_BYTES = kept
+        _lines_cuda.BAND_BYTES = whole

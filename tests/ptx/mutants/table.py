@@ -1,23 +1,33 @@
 """Flaws, one at a time, that the checks of the kernels must see: a check that passes on one is too weak.
 
-``python -m ptx.mutants`` in ``tests/`` plants each of them and prints the table of who found it and how. Each is what
-a careful reader may miss: a barrier or a guard too few, an index that is off only at odd sizes or past the last line,
-an overflow at the largest costs, a rounding.
+A careful reader may miss each of them: a barrier or a guard too few, an index that is off only at odd sizes or past
+the last line, an overflow at the largest costs, a rounding.
 """
 
 from __future__ import annotations
 
-import sys
-import time
 from typing import Any
 
-from ptx.mutation import Mutant, how_caught
+from planting import Mutant
 
-__all__ = ["MUTANTS", "SIZES"]
+__all__ = ["MUTANTS", "OUTCOMES", "SIZES"]
 
 _RACE, _BOUNDS, _UNWRITTEN = "race", "out of bounds", "uninitialised read"
 _BARRIER, _SHUFFLE = "bad barrier", "bad shuffle"
 _ROUNDING, _OVERFLOW, _BORDER, _RULE = "rounding", "overflow", "border", "wrong rule"
+
+OUTCOMES = {
+    _RACE: {"race"},
+    _BOUNDS: {"out of bounds"},
+    _UNWRITTEN: {"uninitialised"},
+    _BARRIER: {"divergent barrier"},
+    _SHUFFLE: {"bad shuffle", "wrong result"},  # a lane that is there but the wrong one gives a wrong value
+    _ROUNDING: {"wrong result"},
+    _OVERFLOW: {"wrong result"},
+    _BORDER: {"wrong result"},
+    _RULE: {"wrong result"},
+}
+"""Outcomes by which a mutant of each kind may be caught."""
 
 SIZES: dict[str, dict[str, Any]] = {
     "dt.check_rf": {"shapes": ((9, 33, 8), (17, 1, 1))},
@@ -49,22 +59,22 @@ MUTANTS = [
     ),
     Mutant(
         "ranges of warps are joined without a barrier", "images.prepare_cuda",
-        "        cuda.syncthreads()\n", "", _RACE, "inputs.check_ranges",
+        "cuda.syncthreads()", "", _RACE, "inputs.check_ranges",
     ),
     Mutant(
         "the barrier of the ranges within a branch", "images.prepare_cuda",
-        "= high\n        cuda.syncthreads()\n", "= high\n            cuda.syncthreads()\n",
-        _BARRIER, "inputs.check_ranges",
+        "if thread & u32(31) == 0:\n    ...\ncuda.syncthreads()",
+        "if thread & u32(31) == 0:\n    ...\n    cuda.syncthreads()", _BARRIER, "inputs.check_ranges",
     ),
     Mutant(
         "every other warp leaves no range in shared memory", "images.prepare_cuda",
-        "if thread & u32(31) == 0:\n            lows", "if thread & u32(63) == 0:\n            lows",
-        _UNWRITTEN, "inputs.check_ranges",
+        "thread & u32(31) == 0", "thread & u32(63) == 0", _UNWRITTEN, "inputs.check_ranges", "ranges",
     ),
     # ------------------------------------------------------------------ costs
     Mutant(
         "a window reads the row below the image", "costs.census_cuda",
-        "clamped(y + dy, height - 1)", "clamped(y + dy, height)", _BOUNDS, "costs.check_census",
+        "row = u32(u32(base + u32(clamped(y + dy, height - 1))) * u32(width))",
+        "row = u32(u32(base + u32(clamped(y + dy, height))) * u32(width))", _BOUNDS, "costs.check_census",
     ),
     Mutant(
         "the last strip goes on into the next row", "costs.census_cuda",
@@ -72,12 +82,13 @@ MUTANTS = [
     ),
     Mutant(
         "a register of the second word is never loaded", "costs.census_cuda",
-        "far[k - 1] = right[", "far[k - 1 if k < 3 else 1] = right[", _UNWRITTEN, "costs.check_census_of_two_words",
+        "far[k - 1] = right[u32(u32(u32(height) * reach) + u - u32(k))]",
+        "far[k - 1 if k < 3 else 1] = right[u32(u32(u32(height) * reach) + u - u32(k))]",
+        _UNWRITTEN, "costs.check_census_of_two_words",
     ),
     Mutant(
         "a warp too few where the last strip is short", "costs.zncc_cuda",
-        "threads = height * -(-width // STRIP)", "threads = height * (width // STRIP)",
-        _UNWRITTEN, "costs.check_zncc",
+        "height * -(-width // STRIP)", "height * (width // STRIP)", _UNWRITTEN, "costs.check_zncc",
     ),
     Mutant(
         "products of pixels in 16 bits", "costs.zncc_cuda",
@@ -97,28 +108,28 @@ MUTANTS = [
     # ------------------------------------------------------------------ path costs
     Mutant(
         "directions are looked up past the table", "aggregation.sgm_cuda",
-        "while i32(direction) + 1 < count and block", "while block", _BOUNDS, "sgm.check_four_paths",
+        "i32(direction) + 1 < count and block >= _1", "block >= _1", _BOUNDS, "sgm.check_four_paths",
     ),
     Mutant(
         "all directions write the first one's costs", "aggregation.sgm_cuda",
-        "u64(u64(direction) * u64(", "u64(u64(0) * u64(", _RACE, "sgm.check_four_paths",
+        "u64(direction) * u64(_1)", "u64(0) * u64(_1)", _RACE, "sgm.check_four_paths",
     ),
     Mutant(
         "lines past the last one write it too", "aggregation.sgm_cuda",
-        "alive = line < lines", "alive = line <= lines", _RACE, "sgm.check_four_paths",
+        "alive = line < lines", "alive = line <= lines", _RACE, "sgm.check_four_paths", "sgm_paths",
     ),
     Mutant(
         "columns past the last one select too", "aggregation.sgm_cuda",
-        "alive = x < width", "alive = x <= width", _RACE, "sgm.check_five_paths",
+        "alive = x < width", "alive = x <= width", _RACE, "sgm.check_five_paths", "sgm_final",
     ),
     Mutant(
         "the smallest cost of the line before a wrap", "aggregation.sgm_cuda",
-        "            if wrapped:\n                low = i32(0)\n", "            if wrapped:\n",
-        _BORDER, "sgm.check_five_paths",
+        "if wrapped:\n    low = i32(0)\n    ...", "if wrapped:\n    ...", _BORDER, "sgm.check_five_paths",
     ),
     Mutant(
         "a wrap to the left lands a pixel short", "aggregation.sgm_cuda",
-        "else i32(x + width)", "else i32(x + width - 1)", _RACE, "sgm.check_five_paths",
+        "i32(x - width) if dx > 0 else i32(x + width)", "i32(x - width) if dx > 0 else i32(x + width - 1)",
+        _RACE, "sgm.check_five_paths",
     ),
     Mutant(
         "the first level of the next line follows the last", "aggregation.sgm_cuda",
@@ -127,18 +138,14 @@ MUTANTS = [
     ),
     Mutant(
         "an edge must exceed its threshold", "aggregation.sgm_cuda",
-        "grey = i32(guide[at])\n            small = p1_edge if jump >= edge else p1\n"
-        "            large = p2_edge if jump >= edge",
-        "grey = i32(guide[at])\n            small = p1_edge if jump >= edge else p1\n"
-        "            large = p2_edge if jump > edge",
-        _RULE, "sgm.check_edges",
+        "small = p1_edge if jump >= edge else p1\nlarge = p2_edge if jump >= edge else p2",
+        "small = p1_edge if jump >= edge else p1\nlarge = p2_edge if jump > edge else p2",
+        _RULE, "sgm.check_edges", "sgm_paths",
     ),
     Mutant(
         "the last path compares with the pixel after", "aggregation.sgm_cuda",
-        "grey = i32(guide[at])\n            for j in range(words):\n                present[j] = coming[j]\n"
-        "                low_sum",
-        "grey = i32(guide[min(u32(at + u32(width)), u32(u32(height * width) - u32(1)))])\n"
-        "            for j in range(words):\n                present[j] = coming[j]\n                low_sum",
+        "pixel = at\ngrey = i32(guide[at])",
+        "pixel = at\ngrey = i32(guide[min(u32(at + u32(width)), u32(u32(height * width) - u32(1)))])",
         _RULE, "sgm.check_edges",
     ),
     Mutant(
@@ -153,7 +160,8 @@ MUTANTS = [
     ),
     Mutant(
         "half a warp votes", "selection.wta_cuda",
-        "cuda.ballot_sync(FULL, best == lowest)", "cuda.ballot_sync(u32(0xFFFF), best == lowest)",
+        "lowest = lowest_of(best)\nvotes = u32(cuda.ballot_sync(FULL, best == lowest))",
+        "lowest = lowest_of(best)\nvotes = u32(cuda.ballot_sync(u32(0xFFFF), best == lowest))",
         _SHUFFLE, "sgm.check_selection",
     ),
     Mutant(
@@ -163,15 +171,17 @@ MUTANTS = [
     ),
     Mutant(
         "the last level is interpolated with a pad", "selection.wta_cuda",
-        "level < levels - 1", "level < levels", _BORDER, "sgm.check_selection",
+        "subpixel != 0 and level > 0 and level < levels - 1", "subpixel != 0 and level > 0 and level < levels",
+        _BORDER, "sgm.check_selection",
     ),
     Mutant(
         "a neighbor of the winner counts as its rival", "selection.wta_cuda",
-        "and away > 1", "and away > 0", _RULE, "sgm.check_selection",
+        "_1 < levels and away > 1 and values[k] < rival", "_1 < levels and away > 0 and values[k] < rival",
+        _RULE, "sgm.check_selection",
     ),
     Mutant(
         "the neighbor above comes from the wrong lane", "selection.wta_cuda",
-        "behind = values[k + 1] if k < held - 1 else above", "behind = values[k + 1] if k < held - 1 else below",
+        "behind = values[k + 1] if k < count - 1 else above", "behind = values[k + 1] if k < count - 1 else below",
         _SHUFFLE, "sgm.check_selection",
     ),
     Mutant(
@@ -196,7 +206,7 @@ MUTANTS = [
     ),
     Mutant(
         "feedback from past the line's end", "aggregation.dt_cuda",
-        "    if u32(n + u32(1)) < count:", "    if n < count:", _BOUNDS, "dt.check_rf",
+        "u32(n + u32(1)) < count", "n < count", _BOUNDS, "dt.check_rf",
     ),
     Mutant(
         "the last segment is walked past the line's end", "aggregation.dt_cuda",
@@ -208,7 +218,8 @@ MUTANTS = [
     ),
     Mutant(
         "a band's totals lie as far apart as the image's", "aggregation.dt_cuda",
-        "    threads = u32(band * quads)", "    threads = u32(width * quads)", _BOUNDS, "dt.check_rf_of_many_levels",
+        "threads = u32(band * quads)", "threads = u32(width * quads)",
+        _BOUNDS, "dt.check_rf_of_many_levels", "dt_walk_totals",
     ),
     Mutant(
         "no mark before the last, short segment", "aggregation._lines_cuda",
@@ -226,27 +237,24 @@ MUTANTS = [
     # ------------------------------------------------------------------ post-processing
     Mutant(
         "bids before all places are cleared", "postprocess.smp_cuda",
-        "x = u32(x + step)\n        cuda.syncthreads()\n        x = first\n        while x < width:\n"
-        "            at = u32(base + x)\n            column = right_column(x, disparity[at], width)\n"
-        "            if column >= 0:\n",
-        "x = u32(x + step)\n        x = first\n        while x < width:\n"
-        "            at = u32(base + x)\n            column = right_column(x, disparity[at], width)\n"
-        "            if column >= 0:\n",
-        _RACE, "post.check_smp",
+        "while x < width:\n    bids[_1] = u64(0xFFFFFFFFFFFFFFFF)\n    x = u32(x + step)\ncuda.syncthreads()",
+        "while x < width:\n    bids[_1] = u64(0xFFFFFFFFFFFFFFFF)\n    x = u32(x + step)", _RACE, "post.check_smp",
     ),
     Mutant("of equal costs the left one stays", "postprocess.smp_cuda", "u32(~x)", "x", _RULE, "post.check_smp"),
     Mutant(
         "a barrier for columns that are there", "postprocess.smp_cuda",
-        "= u64(0xFFFFFFFFFFFFFFFF)\n", "= u64(0xFFFFFFFFFFFFFFFF)\n            cuda.syncthreads()\n",
+        "bids[_1] = u64(0xFFFFFFFFFFFFFFFF)", "bids[_1] = u64(0xFFFFFFFFFFFFFFFF)\ncuda.syncthreads()",
         _BARRIER, "post.check_smp",
     ),
     Mutant(
         "a root that another thread lowered is forgotten", "postprocess.speckle_cuda",
-        "apart = a != high", "apart = False", _RACE, "post.check_speckle",
+        "a = u32(cuda.atomic.min(parent, high, low))\napart = a != high",
+        "a = u32(cuda.atomic.min(parent, high, low))\napart = False", _RACE, "post.check_speckle",
     ),
     Mutant(
         "parents are read as if nobody wrote them", "postprocess.speckle_cuda",
-        "    up = load_relaxed(parent, a)\n    while", "    up = parent[a]\n    while", _RACE, "post.check_speckle",
+        "up = load_relaxed(parent, a)\nwhile up != a:\n    ...", "up = parent[a]\nwhile up != a:\n    ...",
+        _RACE, "post.check_speckle", "_root_of",
     ),
     Mutant(
         "pixels are counted without atomics", "postprocess.speckle_cuda",
@@ -254,9 +262,8 @@ MUTANTS = [
     ),
     Mutant(
         "lanes past the row return before the vote", "postprocess.speckle_cuda",
-        "    starts = _starts(disparity, lane, x, at, width, limit)\n    if x < width:\n        parent",
-        "    if x >= width:\n        return\n    starts = _starts(disparity, lane, x, at, width, limit)\n"
-        "    if x < width:\n        parent",
+        "starts = _starts(disparity, lane, x, at, width, limit)\nif x < width:\n    ...",
+        "if x >= width:\n    return\nstarts = _starts(disparity, lane, x, at, width, limit)\nif x < width:\n    ...",
         _SHUFFLE, "post.check_speckle",
     ),
     Mutant(
@@ -274,8 +281,8 @@ MUTANTS = [
     ),
     Mutant(
         "columns past the row are read", "postprocess.fill_cuda",
-        "        if x < width:\n            d = disparity", "        if x <= width:\n            d = disparity",
-        _BOUNDS, "post.check_fill",
+        "d = f32(np.nan)\nif x < width:\n    d = disparity[_1]",
+        "d = f32(np.nan)\nif x <= width:\n    d = disparity[_1]", _BOUNDS, "post.check_fill",
     ),
     Mutant(
         "infinities start with plus", "postprocess.median_cuda",
@@ -283,28 +290,6 @@ MUTANTS = [
     ),
     Mutant(
         "a thread past the last pixel looks for evidence", "postprocess.chain_cuda",
-        "if at < pixels and bad", "if at <= pixels and bad", _BOUNDS, "post.check_chain",
+        "at < pixels and bad[at] != u8(0)", "at <= pixels and bad[at] != u8(0)", _BOUNDS, "post.check_chain",
     ),
 ]  # fmt: skip
-
-
-def main() -> int:
-    """Print the table; return how many mutants survive."""
-    survivors = 0
-    for mutant in MUTANTS:
-        start = time.perf_counter()
-        how = how_caught(mutant, **SIZES.get(mutant.check, {}))
-        survivors += not how
-        print(
-            f"{mutant.name:52} {mutant.module:24} {mutant.kind:19} {mutant.check:35} {how or 'SURVIVES':20} "
-            f"{time.perf_counter() - start:4.1f} s",
-            flush=True,
-        )
-    print(f"{len(MUTANTS) - survivors} of {len(MUTANTS)} caught")
-    return survivors
-
-
-if __name__ == "__main__":
-    if sys.argv[1:]:
-        sys.exit("usage: python -m ptx.mutants")
-    sys.exit(main() > 0)

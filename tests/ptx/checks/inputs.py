@@ -66,8 +66,8 @@ def check_halved(queue, dtype=np.uint8):
         np.testing.assert_array_equal(queue.fetch(out).reshape(2, *want.left.shape), [want.left, want.right])
         masks = queue.upload("bad", bad.view(np.uint8))
         out = prepare_cuda.halve(queue, "half.bad", masks, np.dtype(np.uint8), 2, shape, True)
-        found = queue.fetch(out).reshape(2, *want.left.shape)
-        np.testing.assert_array_equal(found != 0, [want.left_bad, want.right_bad])
+        masks = queue.fetch(out).reshape(2, *want.left.shape)
+        np.testing.assert_array_equal(masks != 0, [want.left_bad, want.right_bad])
 
 
 def check_blurred(queue, dtype=np.uint8, sigmas=(0.3, 0.7, 2.0)):

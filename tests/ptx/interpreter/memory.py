@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ptx.errors import Misaligned, OutOfBounds, Race, Uninitialised
+from ptx.interpreter.errors import Misaligned, OutOfBounds, Race, Uninitialised
 
 __all__ = ["BASE", "MIDDLE", "SLOT", "Region", "Threads"]
 
@@ -59,7 +59,7 @@ class _Trace:
             setattr(self, name, finer)
 
     def conflicts(self, unit: Any, thread: Any, warp: Any, block: Any, syncs: Any, barriers: Any) -> Any:
-        """Return which accesses collide with earlier ones of other threads."""
+        """Return the accesses that collide with earlier ones of other threads."""
         theirs = self.block[unit]
         touched = theirs != -1
         if not touched.any():
@@ -83,9 +83,9 @@ class _Trace:
         self.barriers[unit], self.syncs[unit] = barriers, syncs
         self.thread[unit] = thread
         twice = self.thread[unit] != thread
-        for held, now in ((self.thread, now_thread), (self.warp, now_warp), (self.block, now_block)):
-            held[unit] = now
-            held[unit[held[unit] != now]] = _MANY
+        for owner, now in ((self.thread, now_thread), (self.warp, now_warp), (self.block, now_block)):
+            owner[unit] = now
+            owner[unit[owner[unit] != now]] = _MANY
         return twice
 
 

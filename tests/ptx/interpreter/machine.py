@@ -11,10 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from ptx.errors import BadShuffle, Deadlock, DivergentBarrier, KernelError, OutOfBounds, Trap, UnknownInstruction
-from ptx.memory import BASE, MIDDLE, SLOT, Region, Threads
-from ptx.parser import KINDS, LOCAL, SHARED
-from ptx.translate import EXIT, Translation, is_barrier, is_warp_operation, shuffle_table
+from ptx.interpreter.errors import (
+    BadShuffle,
+    Deadlock,
+    DivergentBarrier,
+    KernelError,
+    OutOfBounds,
+    Trap,
+    UnknownInstruction,
+)
+from ptx.interpreter.memory import BASE, MIDDLE, SLOT, Region, Threads
+from ptx.interpreter.parser import KINDS, LOCAL, SHARED
+from ptx.interpreter.translate import EXIT, Translation, is_barrier, is_warp_operation, shuffle_table
 
 __all__ = ["Machine"]
 
@@ -73,7 +81,7 @@ class Machine:
 
     @staticmethod
     def address(number: int) -> int:
-        """Return where array `number` begins."""
+        """Return the first address of array `number`."""
         return BASE + (number << SLOT) + MIDDLE
 
     # ------------------------------------------------------------------ the schedule
@@ -155,10 +163,10 @@ class Machine:
         place = int(places[self.rng.integers(ready.size)])
         ready = ready[places == place]
         if chance < 0.8:  # some warps
-            kept = self.rng.random(self.threads.warp_syncs.size)[self.threads.warp_of[ready]] < 0.5
+            awake = self.rng.random(self.threads.warp_syncs.size)[self.threads.warp_of[ready]] < 0.5
         else:  # some lanes
-            kept = self.rng.random(ready.size) < 0.5
-        return place, ready[kept] if kept.any() else ready[:1]
+            awake = self.rng.random(ready.size) < 0.5
+        return place, ready[awake] if awake.any() else ready[:1]
 
     def _stuck(self) -> None:
         waiting = np.flatnonzero(self.state == _IN_WARP)
@@ -208,7 +216,7 @@ class Machine:
         return bool(((rows[:, 0] % 32 == 0) & (rows[:, 31] - rows[:, 0] == 31)).all())
 
     def _warps(self, lanes: Any) -> int:
-        """Return how many warps the lanes belong to; they are in order."""
+        """Return the number of warps of the lanes, which are in order."""
         if lanes is None:
             return int(self.threads.warp_syncs.size)
         return 1 + int(np.count_nonzero(np.diff(self.threads.warp_of[lanes])))
@@ -290,8 +298,8 @@ class Machine:
             if absent.size:
                 who = self.threads.name(int(group[absent[0]]))
                 raise BadShuffle(f"{who} reads lane {table[absent[0]]}, which is not in the mask: {one.text}")
-            held = registers[to[1:]]
-            held[group] = values[table].view(held.dtype)
+            target = registers[to[1:]]
+            target[group] = values[table].view(target.dtype)
             if also and also.strip() != "_":
                 registers[also.strip()[1:]][group] = valid
         elif one.op[0] == "vote":
@@ -302,9 +310,9 @@ class Machine:
                 result = {"all": votes.all(), "any": votes.any(), "uni": votes.all() or not votes.any()}[one.op[2]]
             registers[one.operands[0][1:]][group] = result
         elif one.op[0] == "redux":
-            held = registers[one.operands[0][1:]]
+            target = registers[one.operands[0][1:]]
             values = source(one.operands[1]).view(KINDS[one.op[-1]])
-            held[group] = np.full(group.size, _REDUCE[one.op[2]].reduce(values)).view(held.dtype)
+            target[group] = np.full(group.size, _REDUCE[one.op[2]].reduce(values)).view(target.dtype)
         elif one.op[:2] == ("bar", "warp"):
             self.threads.warp_syncs[self.threads.warp_of[group[0]]] += 1
         else:
@@ -395,7 +403,7 @@ class Machine:
     def load(
         self, place: int, space: str, address: Any, kind: str, count: int, lanes: Any, where: Any, strong: bool
     ) -> Any:
-        """Return what lanes read, ``(lanes,)`` or ``(lanes, count)``."""
+        """Return the values that lanes read, ``(lanes,)`` or ``(lanes, count)``."""
         thread = self.everyone if lanes is None else lanes
         if where is not None:
             shape = (thread.size,) if count == 1 else (thread.size, count)
@@ -452,21 +460,21 @@ class Machine:
             region.touch(index, size, "strong write", self.threads, thread[taking], tell)
         region.read += size * taking.size
         region.written += size * taking.size
-        held = region.view(kind, 1)
+        target = region.view(kind, 1)
         order = np.arange(taking.size) if self.rng is None else self.rng.permutation(taking.size)
         while order.size:  # each round takes the first in line at every address
             _, first = np.unique(index[order], return_index=True)
             now = order[first]
             where_now, lane_now = index[now], taking[now]
-            before = held[where_now]
+            before = target[where_now]
             old[lane_now] = before
-            given = [value[lane_now] for value in values]
+            operands = [value[lane_now] for value in values]
             if how == "cas":
-                held[where_now] = np.where(before == given[0], given[1], before)
+                target[where_now] = np.where(before == operands[0], operands[1], before)
             elif how == "exch":
-                held[where_now] = given[0]
+                target[where_now] = operands[0]
             else:
-                held[where_now] = _REDUCE[how](before, given[0])
+                target[where_now] = _REDUCE[how](before, operands[0])
             order = np.delete(order, first)
         return old
 

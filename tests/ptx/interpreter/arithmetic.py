@@ -1,4 +1,4 @@
-"""What the less simple instructions compute, on numpy arrays of lanes; PTX ISA chapter 9.7."""
+"""Results of the less simple instructions, on numpy arrays of lanes; PTX ISA chapter 9.7."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def divide(a: Any, b: Any) -> Any:
 
 
 def remainder(a: Any, b: Any) -> Any:
-    """Return what integer division leaves, with the sign of `a`."""
+    """Return the remainder of integer division, with the sign of `a`."""
     return np.where(b == 0, a, a - divide(a, b) * b).astype(a.dtype)
 
 
@@ -135,7 +135,7 @@ def top_bit(a: Any) -> Any:
 
 
 def leading_zeros(a: Any) -> Any:
-    """Return how many zeros lead."""
+    """Return the number of leading zeros."""
     return (8 * a.dtype.itemsize - 1 - top_bit(a)).astype(np.uint32)
 
 
@@ -190,7 +190,7 @@ def convert(value: Any, kind: str, rounding: str | None, saturate: bool) -> Any:
 
 
 def saturated(value: Any, kind: str) -> Any:
-    """Return 64-bit integers held to the range of a type."""
+    """Return 64-bit integers clamped to the range of a type."""
     limits = np.iinfo(kind)
     return np.clip(value, limits.min, limits.max).astype(kind)
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ptx.errors import UnknownInstruction
+from ptx.interpreter.errors import UnknownInstruction
 
 __all__ = ["KINDS", "LOCAL", "SHARED", "Instruction", "Program", "parse"]
 
 SHARED, LOCAL = 0x0100_0000, 0x1000_0000
-"""First addresses of a block's shared and of a thread's local memory; `ptx.memory` places global arrays higher."""
+"""First addresses of a block's shared and of a thread's local memory; global arrays lie higher (`memory.py`)."""
 
 KINDS = {
     **{f"{letter}{8 * size}": f"{kind}{size}" for size in (1, 2, 4, 8) for letter, kind in ("uu", "si", "bu")},

@@ -41,9 +41,9 @@ def check_smp(queue: Any, shapes: Any = SHAPES) -> None:
         for dtype in (np.uint16, np.float32):
             cost = np.random.default_rng(1).integers(0, 5, shape).astype(dtype)
             for disparity in maps(shape):
-                held = disparity.flatten()
-                resolve(queue, held, cost.reshape(-1), shape)
-                np.testing.assert_array_equal(held.reshape(shape), single_matching_phase(disparity, cost))
+                flat = disparity.flatten()
+                resolve(queue, flat, cost.reshape(-1), shape)
+                np.testing.assert_array_equal(flat.reshape(shape), single_matching_phase(disparity, cost))
 
 
 def check_smp_rounding(queue: Any) -> None:
@@ -55,9 +55,9 @@ def check_smp_rounding(queue: Any) -> None:
     for _ in range(2):
         disparity = np.nextafter(disparity, np.float32(rng.choice([-1000, 1000])))
     cost = rng.integers(0, 2, shape).astype(np.uint16)
-    held = disparity.flatten()
-    resolve(queue, held, cost.reshape(-1), shape)
-    np.testing.assert_array_equal(held.reshape(shape), single_matching_phase(disparity, cost))
+    flat = disparity.flatten()
+    resolve(queue, flat, cost.reshape(-1), shape)
+    np.testing.assert_array_equal(flat.reshape(shape), single_matching_phase(disparity, cost))
 
 
 def check_speckle(queue: Any, shapes: Any = SHAPES) -> None:
@@ -65,10 +65,10 @@ def check_speckle(queue: Any, shapes: Any = SHAPES) -> None:
     for shape in shapes:
         for gaps, size, difference in ((0, 9, 1), (0.3, 2, 1), (0.1, 4, 0.5), (0.1, 0, 0), (0, 1000, 2), (1, 5, 1)):
             disparity = map_of(shape, 10, gaps, 0, 4)
-            held = disparity.flatten()
-            remove(queue, held, size, shape, difference)
+            flat = disparity.flatten()
+            remove(queue, flat, size, shape, difference)
             expected = remove_speckles(disparity, size, difference)
-            np.testing.assert_array_equal(held.reshape(shape), expected)
+            np.testing.assert_array_equal(flat.reshape(shape), expected)
 
 
 def check_speckle_shapes(queue: Any) -> None:
@@ -85,9 +85,9 @@ def check_speckle_shapes(queue: Any) -> None:
     arms = np.zeros(shape, np.float32)
     arms[:, 3] = arms[:, 60] = arms[-1, 3:61] = 4
     for disparity, size in ((comb, 40), (spiral, 300), (checks, 1), (arms, 83), (arms, 82)):
-        held = disparity.flatten()
-        remove(queue, held, size, shape)
-        np.testing.assert_array_equal(held.reshape(shape), remove_speckles(disparity, size))
+        flat = disparity.flatten()
+        remove(queue, flat, size, shape)
+        np.testing.assert_array_equal(flat.reshape(shape), remove_speckles(disparity, size))
 
 
 def check_fill(queue: Any, shapes: Any = SHAPES) -> None:
@@ -95,10 +95,10 @@ def check_fill(queue: Any, shapes: Any = SHAPES) -> None:
     for shape in shapes:
         for disparity in maps(shape):
             for mode in ("background", "nearest", None):
-                held = disparity.flatten()
-                valid = queue.fetch(fill_cuda(queue, held, mode, np.nan, shape))
+                flat = disparity.flatten()
+                valid = queue.fetch(fill_cuda(queue, flat, mode, np.nan, shape))
                 expected = disparity if mode is None else fill(disparity, mode)
-                np.testing.assert_array_equal(held.reshape(shape), expected)
+                np.testing.assert_array_equal(flat.reshape(shape), expected)
                 np.testing.assert_array_equal(valid.reshape(shape), ~np.isnan(disparity))
 
 
@@ -109,9 +109,9 @@ def check_fill_far(queue: Any) -> None:
     disparity[1, [0, 31, 32, 130]] = 1, 2, 3, 4
     disparity[3, 64] = 9
     for mode in ("background", "nearest"):
-        held = disparity.flatten()
-        fill_cuda(queue, held, mode, np.nan, disparity.shape)
-        np.testing.assert_array_equal(held.reshape(disparity.shape), fill(disparity, mode))
+        flat = disparity.flatten()
+        fill_cuda(queue, flat, mode, np.nan, disparity.shape)
+        np.testing.assert_array_equal(flat.reshape(disparity.shape), fill(disparity, mode))
 
 
 def check_median(queue: Any, shapes: Any = SHAPES) -> None:
@@ -124,11 +124,11 @@ def check_median(queue: Any, shapes: Any = SHAPES) -> None:
 
 
 def check_chain(queue: Any, shape: tuple[int, int] = (9, 40)) -> None:
-    """Compare the chain with everything, with nothing, and on a map without a valid pixel."""
+    """Compare all steps together with everything, with nothing, and on a map without a valid pixel."""
     cost = np.random.default_rng(2).integers(0, 9, shape).astype(np.uint16)
     bad = np.random.default_rng(3).random(shape) < 0.1
     for disparity in (map_of(shape, 4, 0.2), map_of(shape, 4, 1)):
-        for chain in (
+        for steps in (
             PostProcessing(True, 3, "background", 3, -2.0),
             PostProcessing(True, 3, "nearest", 5, -2.0),
             PostProcessing(False, 0, "background", 0, -2.0),
@@ -136,10 +136,10 @@ def check_chain(queue: Any, shape: tuple[int, int] = (9, 40)) -> None:
             PostProcessing(False, 0, None, 0, -2.0),
         ):
             for flags in (None, bad):
-                held = disparity.flatten()
+                flat = disparity.flatten()
                 device_bad = None if flags is None else flags.reshape(-1).view(np.uint8)
-                finished, valid = post_process_cuda(queue, held, cost.reshape(-1), device_bad, chain, shape)
-                expected, measured = post_process(disparity.copy(), cost, flags, chain, Workspace(), 1)
+                finished, valid = post_process_cuda(queue, flat, cost.reshape(-1), device_bad, steps, shape)
+                expected, measured = post_process(disparity.copy(), cost, flags, steps, Workspace(), 1)
                 finished = finished if isinstance(finished, np.ndarray) else queue.fetch(finished)
                 np.testing.assert_array_equal(finished.reshape(shape), expected)
                 np.testing.assert_array_equal(queue.fetch(valid).reshape(shape), measured)

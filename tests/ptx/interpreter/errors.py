@@ -1,4 +1,4 @@
-"""What can be wrong with a kernel, by name. Each message says which instruction and which thread."""
+"""Errors of kernels, by name. Each message says which instruction and which thread."""
 
 from __future__ import annotations
 

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from ptx.arithmetic import FUNCTIONS
-from ptx.errors import UnknownInstruction
-from ptx.parser import KINDS, Instruction, Program
+from ptx.interpreter.arithmetic import FUNCTIONS
+from ptx.interpreter.errors import UnknownInstruction
+from ptx.interpreter.parser import KINDS, Instruction, Program
 
 __all__ = ["EXIT", "Translation", "is_barrier", "is_warp_operation"]
 
 EXIT = -1
-"""Where lanes go that return."""
+"""Target of lanes that return."""
 
 _COMPARE = {
     "eq": "==",
@@ -69,7 +69,7 @@ def _outputs(instruction: Instruction) -> list[str]:
 
 
 class Translation:
-    """A kernel with the functions of its straight runs, made when they are first needed."""
+    """A kernel with the functions of its straight runs, translated when they are first needed."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -268,12 +268,12 @@ class _Writer:
             return
         if name not in self.program.registers:
             raise UnknownInstruction(f"register {operand} in {one.text}")
-        held = self.program.registers[name]
-        if kind != held:
-            if "?" not in (kind, held) and int(held[1:]) > int(kind[1:]) and kind[0] == "i":
-                expression = f"({expression}).astype('i{held[1:]}').view({held!r})"
+        register_kind = self.program.registers[name]
+        if kind != register_kind:
+            if "?" not in (kind, register_kind) and int(register_kind[1:]) > int(kind[1:]) and kind[0] == "i":
+                expression = f"({expression}).astype('i{register_kind[1:]}').view({register_kind!r})"
             else:
-                expression = self.cast(f"({expression})", kind, held)
+                expression = self.cast(f"({expression})", kind, register_kind)
         if one.guard:
             guard = f"~{self.local(one.guard)}" if one.inverted else self.local(one.guard)
             expression = f"np.where({guard}, {expression}, {self.local(name)})"
@@ -316,9 +316,9 @@ class _Writer:
             if middle & {"rz", "rm", "rp"}:
                 raise self.unknown(one)
             name = one.operands[1]
-            held = self.program.registers.get(name[1:], have)
-            source = self.source(name, have if have[1:] == held[1:] or have[0] == "f" else f"u{have[1:]}")
-            if have[0] == "i" and have[1:] != held[1:]:
+            register_kind = self.program.registers.get(name[1:], have)
+            source = self.source(name, have if have[1:] == register_kind[1:] or have[0] == "f" else f"u{have[1:]}")
+            if have[0] == "i" and have[1:] != register_kind[1:]:
                 source += f".view({have!r})"
             return want, f"convert({source}, {want!r}, {rounding!r}, {'sat' in one.op})"
         if op == "selp":
@@ -493,8 +493,8 @@ class _Writer:
 
     def stored(self, operand: str, kind: str) -> str:
         if operand.startswith("%"):
-            held = self.program.registers[operand[1:]]
-            if held[1:] != kind[1:]:
+            register_kind = self.program.registers[operand[1:]]
+            if register_kind[1:] != kind[1:]:
                 return f"{self.local(operand[1:])}.astype('u{kind[1:]}').view({kind!r})"
         return self.source(operand, kind)
 

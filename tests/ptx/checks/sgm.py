@@ -19,40 +19,40 @@ from stereokit.selection.wta import keys_of, select_row, selection_output
 LOWEST = -3
 
 
-def _maps(queue: Any, pixels: int, floats: bool, count: int, subpixel: bool, uniqueness: float, confident: int) -> Any:
+def _maps(queue: Any, pixels: int, floats: bool, count: int, subpixel: bool, uniqueness: float, detail: int) -> Any:
     return wta_cuda.Maps(
         queue.array("disparity", pixels, np.float32),
         queue.array("cost", pixels, np.float32 if floats else np.uint16),
-        queue.array("confidence", (0, 1, 3)[confident] * pixels or 1, np.float32),
+        queue.array("confidence", (0, 1, 3)[detail] * pixels or 1, np.float32),
         count,
         LOWEST,
         int(subpixel),
         np.float32(uniqueness / 100),
-        confident,
+        detail,
     )
 
 
 def _compare(queue: Any, maps: Any, disparity: np.ndarray, cost: np.ndarray, sure: np.ndarray) -> None:
     np.testing.assert_array_equal(queue.fetch(maps.disparity), disparity.ravel())
     np.testing.assert_array_equal(queue.fetch(maps.cost), cost.ravel())
-    if maps.confident:
-        np.testing.assert_array_equal(queue.fetch(maps.confidence), sure[: (0, 1, 3)[maps.confident]].ravel())
+    if maps.detail:
+        np.testing.assert_array_equal(queue.fetch(maps.confidence), sure[: (0, 1, 3)[maps.detail]].ravel())
 
 
 def _winners(
     sure: np.ndarray, disparity: np.ndarray, cost: np.ndarray, count: int, subpixel: bool, least: float
 ) -> Any:
-    """Return what the CPU writes to: `sure` is its confidence and the two candidates."""
+    """Return the maps for the CPU: `sure` is its confidence and the two candidates."""
     return selection_output(disparity, cost, sure[0], count, LOWEST, subpixel, least, sure[1:])
 
 
 def check_paths(
     queue: Any, sgm: Sgm, shape: tuple[int, int], count: int, subpixel: bool = True, uniqueness: float = 0.0,
-    confident: int = 1, steep: bool = False,
+    detail: int = 1, steep: bool = False,
 ) -> None:  # fmt: skip
     """Compare the maps of random costs with a patch of equal ones, on a guide with edges around the threshold.
 
-    Where `steep`, all levels but one are as dear as can be, and path costs grow along the paths to their largest.
+    Where `steep`, all levels but one have the largest cost, and path costs grow along the paths to their largest.
     """
     rng = np.random.default_rng(0)
     cost = Census("5x5")
@@ -70,7 +70,7 @@ def check_paths(
     padded = pad_levels(count)
     volume = np.full((*shape, padded), 255, np.uint8)
     volume[:, :, :count] = costs
-    maps = _maps(queue, disparity.size, False, count, subpixel, uniqueness, confident)
+    maps = _maps(queue, disparity.size, False, count, subpixel, uniqueness, detail)
     words = queue.upload("costs", volume.view(np.uint32))
     sgm_cuda.aggregate(queue, sgm, cost, words, queue.upload("guide", guide), shape, padded, maps)
     _compare(queue, maps, disparity, total, sure)
@@ -85,7 +85,7 @@ def check_five_paths(queue):
 
 
 def check_eight_paths(queue):
-    check_paths(queue, Sgm(15, 85, paths=8), (6, 5), 40, uniqueness=4.0, confident=0)
+    check_paths(queue, Sgm(15, 85, paths=8), (6, 5), 40, uniqueness=4.0, detail=0)
 
 
 def check_full_groups(queue):
@@ -105,7 +105,7 @@ def check_largest_path_costs(queue):
 
 def check_selection(
     queue: Any, floats: bool = False, shape: tuple[int, int] = (3, 7), count: int = 10, subpixel: bool = True,
-    uniqueness: float = 3.0, confident: int = 2, bands: tuple[int, ...] = (0, 4, 7),
+    uniqueness: float = 3.0, detail: int = 2, bands: tuple[int, ...] = (0, 4, 7),
 ) -> None:  # fmt: skip
     """Compare selection from a random volume, in bands of columns, with ties and a pixel of zeros."""
     rng = np.random.default_rng(0)
@@ -124,7 +124,7 @@ def check_selection(
     for y in range(height):
         row = values[y].ravel()
         select_row(keys_of(row), row, width, tuple(range(whole // 64)), y * width, out)
-    maps = _maps(queue, cost.size, floats, count, subpixel, uniqueness, confident)
+    maps = _maps(queue, cost.size, floats, count, subpixel, uniqueness, detail)
     for first, end in itertools.pairwise(bands):
         part = queue.upload("totals", np.ascontiguousarray(volume[:, first:end]))
         wta_cuda.select(queue, part, floats, first, end - first, shape, padded, maps)
@@ -139,9 +139,9 @@ def check_selection_of_floats(queue):
     check_selection(queue, floats=True)
 
 
-def check_doubt(queue):
+def check_zeroed_confidence(queue):
     confidence = np.linspace(0, 1, 200, dtype=np.float32)
     valid = (np.arange(200) % 3 != 0).astype(np.uint8)
-    held = queue.upload("confidence", confidence)
-    queue.launch(wta_cuda.doubt, 2, held, queue.upload("valid", valid), confidence.size)
-    np.testing.assert_array_equal(queue.fetch(held), confidence * valid)
+    on_device = queue.upload("confidence", confidence)
+    queue.launch(wta_cuda.zero_invalid_confidence, 2, on_device, queue.upload("valid", valid), confidence.size)
+    np.testing.assert_array_equal(queue.fetch(on_device), confidence * valid)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ptx.harness import Buffer, Report, run
+from ptx.interpreter.harness import Buffer, Report, run
 
 __all__ = ["EmulatedQueue"]
 
 
 class EmulatedQueue:
-    """A stand-in for a GPU; its arrays are `Buffer`, so that reads of what nobody wrote are found.
+    """A stand-in for a GPU; its arrays are `Buffer`, so that reads of unwritten memory are errors.
 
     Parameters
     ----------
@@ -23,9 +23,9 @@ class EmulatedQueue:
     Attributes
     ----------
     launches : list of (name, blocks, Report)
-        What ran.
+        Launches so far.
     arrays : dict of Buffer
-        What is resident.
+        Resident arrays.
     """
 
     def __init__(self, seed: int | None = None) -> None:
@@ -42,33 +42,33 @@ class EmulatedQueue:
     def upload(self, name: str, values: np.ndarray) -> Buffer:
         """Return the array called `name` with a copy of `values`."""
         flat = np.ascontiguousarray(values).reshape(-1)
-        held = self.array(name, flat.size, flat.dtype)
-        held.values[:] = flat
-        held.known[:] = 1
-        return held
+        array = self.array(name, flat.size, flat.dtype)
+        array.values[:] = flat
+        array.known[:] = 1
+        return array
 
     def cached(self, name: str, key: Any, make: Callable[[], np.ndarray]) -> Buffer:
-        """Return the array called `name`, made anew when the key changes."""
+        """Return the array called `name`, which is new when the key changes."""
         if self._keys.get(name, self) != key:
             self.upload(name, make())
             self._keys[name] = key
         return self.arrays[name]
 
-    def view(self, held: Buffer, dtype: Any) -> Buffer:
+    def view(self, array: Buffer, dtype: Any) -> Buffer:
         """Return the same memory as another type."""
-        return held.view(dtype)
+        return array.view(dtype)
 
     def launch(self, what: Any, blocks: int, *arguments: Any) -> None:
         """Run a kernel."""
         report = run(what, blocks, *arguments, seed=self.seed)
         self.launches.append((what.name, blocks, report))
 
-    def copy(self, held: Buffer) -> Buffer:
+    def copy(self, array: Buffer) -> Buffer:
         """Return a new array with the same content."""
-        made = Buffer(held.size, held.dtype)
-        made.values[:], made.known[:] = held.values, held.known
-        return made
+        out = Buffer(array.size, array.dtype)
+        out.values[:], out.known[:] = array.values, array.known
+        return out
 
-    def fetch(self, held: Buffer) -> np.ndarray:
+    def fetch(self, array: Buffer) -> np.ndarray:
         """Return a copy of an array."""
-        return held.values.copy()
+        return array.values.copy()

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ptx.machine import Machine
-from ptx.memory import Region
-from ptx.parser import parse
-from ptx.translate import Translation
+from ptx.interpreter.machine import Machine
+from ptx.interpreter.memory import Region
+from ptx.interpreter.parser import parse
+from ptx.interpreter.translate import Translation
 
 __all__ = ["CAPABILITY", "Buffer", "Report", "forget", "run", "translation_of"]
 
@@ -39,9 +39,9 @@ class Buffer:
 
     @classmethod
     def _of(cls, values: np.ndarray, known: np.ndarray) -> Buffer:
-        made = cls.__new__(cls)
-        made.values, made.known = values, known
-        return made
+        buffer = cls.__new__(cls)
+        buffer.values, buffer.known = values, known
+        return buffer
 
     def view(self, dtype: Any) -> Buffer:
         """Return the same memory as another type."""
@@ -68,7 +68,7 @@ class Buffer:
 
 @dataclass(frozen=True)
 class Report:
-    """What a launch did."""
+    """Counts of a launch."""
 
     instructions: int  # of threads, counted in whole straight runs
     issued: int  # the same of warps
@@ -81,9 +81,9 @@ def translation_of(kernel: Any) -> Translation:
     key = kernel if isinstance(kernel, str) else id(kernel)
     if key not in _TRANSLATIONS:
         text = kernel if isinstance(kernel, str) else kernel.ptx(CAPABILITY)
-        made = Translation(parse(text))
-        made.kernel = kernel  # keeps the key's object alive
-        _TRANSLATIONS[key] = made
+        translation = Translation(parse(text))
+        translation.kernel = kernel  # keeps the key's object alive
+        _TRANSLATIONS[key] = translation
     return _TRANSLATIONS[key]
 
 
@@ -121,9 +121,9 @@ def run(
     Raises
     ------
     KernelError
-        One of `ptx.errors`, at the first thing that is wrong.
+        One of `ptx.interpreter.errors`, at the first thing that is wrong.
     """
-    made = translation_of(kernel)
+    translation = translation_of(kernel)
     plain = isinstance(kernel, str)
     _check(kernel, arguments)
     regions, places = _regions(arguments)
@@ -139,7 +139,7 @@ def run(
             parameters.append(address)
         else:
             parameters += [0, 0, values.size, values.itemsize, address, values.size, values.itemsize]
-    machine = Machine(made, blocks, block or kernel.block, parameters, regions, seed, max_runs)
+    machine = Machine(translation, blocks, block or kernel.block, parameters, regions, seed, max_runs)
     machine.run()
     order = [regions[places[number][0]] for number in sorted(places)]
     return Report(machine.instructions, machine.issued, tuple(r.read for r in order), tuple(r.written for r in order))

@@ -240,7 +240,7 @@ def test_lenses_that_do_not_go_together():
         with pytest.raises(OptionError, match=words):
             Camera(rigs.K1, **wrong)
     wide = Camera([[60.0, 0, 160], [0, 60, 120], [0, 0, 1]], np.zeros(4), "fisheye", *size)  # 300 degrees across
-    with pytest.raises(OptionError, match="lenses are too wide, or their distortion is wrong.*choose focal"):
+    with pytest.raises(OptionError, match=r"lenses are too wide, or their distortion is wrong.*choose focal"):
         StereoRig(wide, wide, np.eye(3), (-0.1, 0, 0)).rectification()
     folded = Camera(rigs.K1, (-500.0, 0, 0, 0), "pinhole", *size)
     with pytest.raises(OptionError, match="hardly a pixel of it lies within the raw images"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 
 import cv2
 import numpy as np
@@ -54,7 +55,7 @@ SPELLINGS = {
     "M1 D1": basic("M{}"),
     "cameraMatrix1 distCoeffs1": basic("cameraMatrix{}", "distCoeffs{}"),
     "camera_matrix_left": basic("camera_matrix_{}", "dist_coeffs_{}", ("left", "right")),
-    "left_camera_matrix": basic("{}_camera_matrix", "{}_distortion_coefficients", ("left", "right"), "rotation", "tvec"),
+    "left_camera_matrix": basic("{}_camera_matrix", "{}_distortion_coefficients", ("left", "right"), "rot", "tvec"),
     "leftCameraMatrix": basic("{}CameraMatrix", "{}DistCoeffs", ("left", "right"), "rotationMatrix", "translation"),
     "K_l": basic("K_{}", "D_{}", ("l", "r"), "Rot", "Trans"),
     "mtxL": basic("mtx{}", "dist{}", ("L", "R"), "R", "T"),
@@ -69,6 +70,28 @@ def test_opencv_files_in_the_usual_spellings(tmp_path, name, suffix):
     path = tmp_path / f"stereo{suffix}"
     path.write_text(opencv(suffix, {"image_width": WIDTH, "image_height": HEIGHT, **SPELLINGS[name]}))
     check(read_rig(path))
+
+
+@pytest.mark.parametrize("name", SPELLINGS)
+def test_arrays_as_numpy_and_json_have_them(tmp_path, name):
+    np.savez(tmp_path / "stereo.npz", imageSize=(640, 480), rms=0.3, note="mine", **SPELLINGS[name])
+    check(read_rig(tmp_path / "stereo.npz"))
+    plain = {key: value.tolist() for key, value in SPELLINGS[name].items()}
+    for content in ({"image_size": [640, 480], **plain}, {"width": 640, "height": 480, **plain}):
+        (tmp_path / "stereo.json").write_text(json.dumps(content))
+        check(read_rig(tmp_path / "stereo.json"))
+
+
+def test_a_camera_for_each_side(tmp_path):
+    sides = [{"K": k.tolist(), "dist_coeffs": d.tolist(), "width": 640, "height": 480} for k, d in ((K1, D1), (K2, D2))]
+    pose = {"R": R.tolist(), "T": T.tolist()}
+    for content in (
+        {"left": sides[0], "right": sides[1], "extrinsics": pose}, {"cam0": sides[0], "cam1": sides[1], **pose},
+        {"left_camera": sides[0], "right_camera": sides[1], "stereo": pose},
+        {"camera_1": sides[0], "camera_2": sides[1], **pose},
+    ):  # fmt: skip
+        (tmp_path / "stereo.json").write_text(json.dumps(content))
+        check(read_rig(tmp_path / "stereo.json"))
 
 
 @pytest.mark.parametrize(
@@ -506,6 +529,7 @@ def skewed(k):
 
 
 WRONG = {
+    "omnidirectional": ({"xi1": np.array([[2.5]])}, "omnidirectional one .it has xi"),
     "skew": ({"K1": skewed(K1)}, r"k1 must be of a camera without skew, got a skew of 12"),
     "rotation": ({"R": R * 1.1}, r"rotation \(R\) must be a rotation matrix"),
     "mirrored": ({"R": np.diag([1.0, 1, -1])}, "must be a rotation matrix"),
@@ -609,10 +633,25 @@ def test_whatever_a_file_holds_is_one_line(tmp_path, name, monkeypatch):
     assert not (tmp_path / "hacked").exists()
 
 
+def test_archives_that_are_none(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("K1.npy", b"\0" * 2**24)
+    with pytest.raises(FileError, match="arrays are too large"):
+        read_rig(tmp_path / "bomb.npz")
+    np.savez(tmp_path / "object.npz", K1=np.array([object()], dtype=object), allow_pickle=True)
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "object.npz").read_bytes()[:60])
+    np.savez(tmp_path / "empty.npz", a=3)
+    for name in ("object.npz", "cut.npz", "empty.npz"):
+        with pytest.raises(FileError) as caught:
+            read_rig(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
 def test_a_file_that_is_none_of_them_says_what_was_looked_for(tmp_path):
     (tmp_path / "notes.yaml").write_text("camera: mine\nlens: good\n")
     with pytest.raises(
-        FileError, match=r"no calibration known here; known are OpenCV's YAML, XML.*ROS camera_info .*Kalibr"
+        FileError,
+        match=r"no calibration known here; known are OpenCV's YAML, XML, JSON and npz.*ROS camera_info .*Kalibr",
     ):
         read_rig(tmp_path / "notes.yaml")
     with pytest.raises(

@@ -35,9 +35,10 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.cli.output import Table
+from stereokit.cli.pair import AlignOption, MaskOption, NodataOption, RightMaskOption, StrictOption
 from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
-from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES
+from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES, read_image
 from stereokit_evaluation.batch.job import Job, matcher_of
 from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
 from stereokit_evaluation.batch.run import Engine, Summary, identity, on_threads, run_batch
@@ -64,6 +65,11 @@ def batch(
     fill: FillOption = None,
     device: DeviceOption = "auto",
     settings: SettingsOption = None,
+    mask: MaskOption = None,
+    right_mask: RightMaskOption = None,
+    nodata: NodataOption = None,
+    align: AlignOption = False,
+    strict: StrictOption = False,
     file_format: Annotated[str, typer.Option("--format", help="png (KITTI), pfm, npy or tiff.")] = "png",
     color: Annotated[bool, typer.Option("--color", help="Also coloured pictures, in DIR/color.")] = False,
     pattern: Annotated[
@@ -88,7 +94,7 @@ def batch(
     if file_format == "png":
         check_fits_png("--format png", min_disparity, max_disparity)
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
-    given = {"refiner": refiner, "weights": weights, "fill": fill}
+    given = {"refiner": refiner, "weights": weights, "fill": fill, "nodata": nodata}
     options.update({name: value for name, value in given.items() if value is not None})
     options["device"] = device
     options.update(parse_settings(settings or (), _OWN_OPTIONS))
@@ -100,7 +106,11 @@ def batch(
     if weights is not None and weights.endswith(".safetensors"):
         options["weights"] = os.path.abspath(weights)
     where = os.path.abspath(output)
-    job = Job(where, f".{file_format}", color, method, tuple(sorted(options.items())))
+    masks = [None if path is None else os.path.abspath(path) for path in (mask, right_mask)]
+    for path in (mask, right_mask):
+        if path is not None:
+            read_image(path)  # refuses what is none
+    job = Job(where, f".{file_format}", color, method, tuple(sorted(options.items())), *masks, align, strict)
     matcher_of(job)  # refuses what cannot be
     run_on, engine_options, client = _engine(engine, scheduler, workers)
     try:

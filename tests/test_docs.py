@@ -30,6 +30,7 @@ from typer.testing import CliRunner
 import stereokit
 from stereokit.cli.app import app
 from stereokit.methods import parse_method
+from stereokit.rig import Camera, StereoRig
 
 ROOT = Path(__file__).parents[1]
 CARD = ROOT / "refiners" / "stereokit_refiners" / "weights" / "MODEL_CARD.md"
@@ -37,7 +38,7 @@ KITTI = ROOT / "refiners" / "kitti"
 CARDS = [CARD, KITTI / "stereokit_kitti_weights" / "MODEL_CARD.md", KITTI / "README.md"]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *CARDS, *sorted((ROOT / "docs").glob("*.md"))]
 RUN = ("export", "info", "list", "match", "view")
-EXTRAS = {"export": ("onnx", "onnxruntime"), "--refiner": ("openvino",), "view": ("jinja2",)}
+EXTRAS = {"export": ("onnxruntime",), "--refiner": ("openvino",), "view": ("jinja2",)}
 SHELL, OTHER = ("", "shell"), ("text", "toml")
 FENCE = re.compile(r"(?:^<!-- not run: (?P<reason>.+) -->\n)?^```(?P<language>.*)\n(?P<code>(?s:.*?))^```$", re.M)
 
@@ -86,6 +87,8 @@ def folder(street, tmp_path, monkeypatch):
     np.save("left.npy", street.left)
     np.save("right.npy", street.right)
     (tmp_path / "camera.json").write_text('{"fx": 180, "fy": 180, "cx0": 155, "cy": 43, "baseline_m": 0.2}')
+    lens = Camera([[180, 0, 155], [0, 180, 46], [0, 0, 1]], width=310, height=94)
+    StereoRig(lens, lens, np.eye(3), (-0.2, 0, 0)).save(tmp_path / "rig.yml")
     (tmp_path / "mine").mkdir()
     shutil.copy(KITTI / "stereokit_kitti_weights" / "cnn.safetensors", tmp_path / "mine" / "weights.safetensors")
     return tmp_path
@@ -243,7 +246,7 @@ def public_modules() -> set[str]:
 
 INTERNAL = re.compile(
     r"stereokit\.(kernels|cuda|images|methods|io\.|cli\.(?!app))"
-    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|reference|evidence|mixture)"
+    r"|stereokit_refiners\.runtimes\.(openvino|onnx|onnx_file|opencv|torch|reference|evidence|mixture)"
     r"|stereokit_evaluation\.(common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes|generated))"
     r"|.*_cuda$"
 )

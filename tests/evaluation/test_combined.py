@@ -87,7 +87,6 @@ def test_a_bag_becomes_maps_and_a_bag(tmp_path):
     rosbags = pytest.importorskip("rosbags")
     assert rosbags
     from rosbags.highlevel import AnyReader
-
     from test_bags import LEFT, MS, RIGHT, START, Messages, P, Q, written
 
     messages = Messages(2)

@@ -109,9 +109,11 @@ class Summary:
 def identity(job: Job, inputs: Any) -> dict[str, Any]:
     """Return everything that all maps of a job depend on: resolved options, weights, version and inputs."""
     matcher = matcher_of(job)
+    evidence = {"mask": job.mask, "right_mask": job.right_mask, "align": job.align or None}
     return {
         "inputs": inputs,
         **matcher.identity(),
+        **{name: value for name, value in evidence.items() if value is not None},
         "format": job.suffix,
         "color": job.color,
         **({"rig": digest(job.rig), "alpha": job.alpha} if job.rig else {}),

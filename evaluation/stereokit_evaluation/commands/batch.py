@@ -39,10 +39,11 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.cli.output import Table
+from stereokit.cli.pair import AlignOption, MaskOption, NodataOption, RightMaskOption, StrictOption
 from stereokit.cli.rig import AlphaOption, RigOption, rig_files
 from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
-from stereokit.io import DISPARITY_SUFFIXES, LAYOUTS, READABLE_SUFFIXES, read_disparity
+from stereokit.io import DISPARITY_SUFFIXES, LAYOUTS, READABLE_SUFFIXES, read_disparity, read_image
 from stereokit_evaluation.batch.bags import Bag, is_bag, write_bag
 from stereokit_evaluation.batch.combined import CombinedFiles
 from stereokit_evaluation.batch.job import Job, matcher_of
@@ -71,6 +72,11 @@ def batch(
     fill: FillOption = None,
     device: DeviceOption = "auto",
     settings: SettingsOption = None,
+    mask: MaskOption = None,
+    right_mask: RightMaskOption = None,
+    nodata: NodataOption = None,
+    align: AlignOption = False,
+    strict: StrictOption = False,
     file_format: Annotated[str, typer.Option("--format", help="png (KITTI), pfm, npy or tiff.")] = "png",
     color: Annotated[bool, typer.Option("--color", help="Also coloured pictures, in DIR/color.")] = False,
     rig: RigOption = None,
@@ -102,7 +108,7 @@ def batch(
     if file_format == "png":
         check_fits_png("--format png", min_disparity, max_disparity)
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
-    user_options = {"refiner": refiner, "weights": weights, "fill": fill}
+    user_options = {"refiner": refiner, "weights": weights, "fill": fill, "nodata": nodata}
     options.update({name: value for name, value in user_options.items() if value is not None})
     options["device"] = device
     options.update(parse_settings(settings or (), _OWN_OPTIONS))
@@ -117,7 +123,12 @@ def batch(
     if alpha is not None and rig is None:
         raise OptionError("--alpha is for --rig")
     raw = () if rig is None else tuple(os.path.abspath(path) for path in rig_files(rig))
-    job = Job(folder, f".{file_format}", color, method, tuple(sorted(options.items())), raw, alpha)
+    left_mask, other_mask = (None if path is None else os.path.abspath(path) for path in (mask, right_mask))
+    for path in (mask, right_mask):
+        if path is not None:
+            read_image(path)  # refuses what is none
+    ordered = tuple(sorted(options.items()))
+    job = Job(folder, f".{file_format}", color, method, ordered, raw, alpha, left_mask, other_mask, align, strict)
     matcher_of(job)  # refuses bad options
     run_on, engine_options, client = _engine(engine, scheduler, workers)
     try:

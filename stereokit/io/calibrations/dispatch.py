@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from stereokit.errors import FileError, OptionError
 from stereokit.io.calibrations.chains import from_euroc, from_kalibr, is_euroc, is_kalibr
@@ -27,7 +31,8 @@ from stereokit.io.reading import parsing, read_text
 __all__ = ["KNOWN", "digest", "name_of", "read_content"]
 
 KNOWN = (
-    "known are OpenCV's YAML, XML and JSON (K1 D1 K2 D2 R T, P1 P2 or Q), ROS camera_info (left.yaml and right.yaml), "
+    "known are OpenCV's YAML, XML, JSON and npz (K1 D1 K2 D2 R T, P1 P2 or Q), "
+    "ROS camera_info (left.yaml and right.yaml), "
     "Kalibr's camchain, EuRoC's sensor.yaml, ZED's .conf, KITTI, Middlebury's calib.txt, K.txt with a baseline, "
     "and JSON with fx, fy, cx0, cy, baseline_m"
 )
@@ -107,7 +112,19 @@ def _text(path: Path) -> str:
         size = os.stat(path).st_size
     if size > _MOST_BYTES:
         raise FileError(f"{str(path)!r} is no calibration: it has {size} bytes, and one has some thousand")
-    return read_text(path, "calibration")
+    with parsing(path, "calibration"), path.open("rb") as file:
+        archive = file.read(4) == b"PK\3\4"
+    return _archive_text(path) if archive else read_text(path, "calibration")
+
+
+def _archive_text(path: Path) -> str:
+    """Return the arrays of an npz file as JSON; pickles are not opened, nor what unpacks to more than it should."""
+    with parsing(path, "calibration"):
+        with zipfile.ZipFile(path) as archive:
+            if sum(part.file_size for part in archive.infolist()) > _MOST_BYTES:
+                raise OptionError("it is no calibration: its arrays are too large for one")
+        with np.load(path, allow_pickle=False) as arrays:
+            return json.dumps({name: arrays[name].tolist() for name in arrays.files}, default=str)
 
 
 def _parsed(paths: Sequence[Path], texts: Sequence[str], cameras: tuple[int, int] | None, size: Size | None) -> Content:

@@ -24,7 +24,7 @@ from stereokit_evaluation.bench.table import load as system_load
 from stereokit_evaluation.bench.table import machine, versions
 from stereokit_evaluation.common.folders import check_folder, make_folder
 from stereokit_evaluation.common.progress import progress
-from stereokit_evaluation.data.datasets import load, select
+from stereokit_evaluation.data.datasets import dataset_names, load, select
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.data.published import PAPER
 from stereokit_evaluation.data.splits import comparison, count_frames, split
@@ -41,7 +41,7 @@ _DEFAULT_DISPARITIES = 128
 
 
 def study(
-    dataset: Annotated[str, typer.Option(help="kitti2015, scenes, or another data set of evaluate.")] = "scenes",
+    dataset: Annotated[str, typer.Option(help=f"One of {', '.join(dataset_names())}.")] = "scenes",
     root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
     which: Annotated[
         str | None,

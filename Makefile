@@ -21,7 +21,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.user: pyproject.toml | $(BIN)/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable ".[evaluation,fast]"
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable ".[refiners,scenes]"
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml refiners/kitti/pyproject.toml constraints.txt | $(BIN)/python

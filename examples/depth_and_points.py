@@ -1,7 +1,7 @@
 """From a calibrated pair to depth in metres and a point cloud.
 
 ``python depth_and_points.py left.png right.png calib.txt`` takes a rectified pair with its calibration (Middlebury,
-ETH3D, KITTI or JSON); without arguments it draws a synthetic street (``stereokit[evaluation]``).
+ETH3D, KITTI or JSON); without arguments it draws a synthetic street (``stereokit[scenes]``).
 """
 
 import sys
@@ -27,7 +27,9 @@ near, middle, far = np.nanpercentile(depth_m, (5, 50, 95))
 one_pixel = middle**2 / (camera.fx * camera.baseline_m)  # how far depth moves when disparity moves by one pixel
 print(f"depth: {near:.1f} m to {far:.1f} m, median {middle:.1f} m, where one pixel is {one_pixel:.2f} m")
 
-kept = np.isfinite(depth_m) & (depth_m < 80)  # what lies farther is mostly noise
+usable = np.isfinite(depth_m) & (depth_m < 80)  # farther points are mostly noise
 colors = left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2)
-stereokit.io.write_ply("points.ply", result.points(camera)[kept], colors[kept])  # x right, y down, z forward, metres
-print(f"points.ply: {np.count_nonzero(kept)} points")
+stereokit.io.write_ply(
+    "points.ply", result.points(camera)[usable], colors[usable]
+)  # x right, y down, z forward, metres
+print(f"points.ply: {np.count_nonzero(usable)} points")

@@ -1,7 +1,7 @@
 """Match a pair and write the disparity map, and a picture of it.
 
 ``python first_match.py left.png right.png`` takes a rectified pair of yours; without arguments it draws a synthetic
-street (``stereokit[evaluation]``).
+street (``stereokit[scenes]``).
 """
 
 import sys

@@ -19,6 +19,7 @@ from stereokit.io import read_disparity, read_image, write_disparity
 from stereokit.large import LargeResult, match_large
 from stereokit.matching import METHODS, Matcher, match, warmup
 from stereokit.notices import PairWarning
+from stereokit.pairs import Fault, PairReport, align_rows, check_pair
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
 from stereokit.selection import select
@@ -33,11 +34,13 @@ __all__ = [
     "Census",
     "DeviceError",
     "Disparity",
+    "Fault",
     "FileError",
     "InputError",
     "LargeResult",
     "Matcher",
     "OptionError",
+    "PairReport",
     "PairWarning",
     "RowCost",
     "StereokitError",
@@ -46,6 +49,8 @@ __all__ = [
     "Zncc",
     "__version__",
     "aggregate",
+    "align_rows",
+    "check_pair",
     "cost_volume",
     "match",
     "match_large",

@@ -1,4 +1,4 @@
-"""What the methods are called, and how they are set when nobody says otherwise.
+"""The names of the methods, and their default options.
 
 The defaults come from a search: one option at a time around them, on the tuning frames of KITTI 2015 and on three
 scenes of Middlebury, with one set of options for both. They are chosen by the tuning column and by the scenes;
@@ -11,7 +11,7 @@ and Motorcycle (``python -m stereokit_evaluation.commands.search --data DIR --ou
     S1 census+dt: tuning 5.70, validation 4.92, all 5.45; cones 3.34, teddy 4.87, Motorcycle 4.35
       smooth      0: 6.13 (4.41); 0.5: 5.98 (4.03); 0.6: 5.75 (4.04); 0.7: 5.70 (4.19); 0.8: 5.71 (4.38);
                   1.0: 5.72 (4.74)
-      outside     0.3: 5.68 (4.18); 0.5: 5.70 (4.19); 0.7: 5.72 (4.20); 1.0: 5.74 (4.22); None: 5.69 (4.18)
+      border_cost 0.3: 5.68 (4.18); 0.5: 5.70 (4.19); 0.7: 5.72 (4.20); 1.0: 5.74 (4.22); None: 5.69 (4.18)
       smp         False: 6.06 (4.45)
       speckle     0: 7.16 (4.56); 0.0001: 5.96 (4.24); 0.0002: 5.72 (4.20); 0.0003: 5.70 (4.19); 0.0005: 5.71 (4.50);
                   0.001: 5.98 (4.71)
@@ -29,7 +29,7 @@ and Motorcycle (``python -m stereokit_evaluation.commands.search --data DIR --ou
     S2 census+sgm: tuning 4.79, validation 4.30, all 4.63; cones 2.73, teddy 2.89, Motorcycle 3.80
       smooth      0: 5.07 (3.21); 0.5: 4.88 (3.02); 0.6: 4.79 (3.14); 0.7: 4.81 (3.35); 0.8: 4.82 (3.42);
                   1.0: 4.82 (3.83)
-      outside     0.3: 4.80 (3.11); 0.5: 4.79 (3.14); 0.7: 4.79 (3.19); 1.0: 4.81 (3.18); None: 4.78 (3.14)
+      border_cost 0.3: 4.80 (3.11); 0.5: 4.79 (3.14); 0.7: 4.79 (3.19); 1.0: 4.81 (3.18); None: 4.78 (3.14)
       smp         False: 4.78 (3.21)
       speckle     0: 5.33 (3.16); 0.0001: 4.73 (3.11); 0.0002: 4.79 (3.14); 0.0003: 4.88 (3.17); 0.0005: 4.99 (3.25);
                   0.001: 5.21 (3.36)
@@ -47,7 +47,7 @@ and Motorcycle (``python -m stereokit_evaluation.commands.search --data DIR --ou
     S3 zncc+dt: tuning 5.65, validation 4.86, all 5.40; cones 3.46, teddy 5.08, Motorcycle 4.38
       smooth      0: 6.11 (4.59); 0.5: 5.88 (4.23); 0.6: 5.77 (4.24); 0.7: 5.65 (4.33); 0.8: 5.62 (4.50);
                   1.0: 5.65 (4.70)
-      outside     0.3: 5.71 (4.44); 0.5: 5.65 (4.33); 0.7: 5.65 (4.34); 1.0: 5.67 (4.36); None: 5.65 (4.35)
+      border_cost 0.3: 5.71 (4.44); 0.5: 5.65 (4.33); 0.7: 5.65 (4.34); 1.0: 5.67 (4.36); None: 5.65 (4.35)
       smp         False: 6.09 (4.67)
       speckle     0: 7.06 (4.65); 0.0001: 6.04 (4.39); 0.0002: 5.73 (4.36); 0.0003: 5.65 (4.33); 0.0005: 5.67 (4.40);
                   0.001: 5.91 (4.59)
@@ -66,7 +66,7 @@ and Motorcycle (``python -m stereokit_evaluation.commands.search --data DIR --ou
     S4 zncc+sgm: tuning 5.02, validation 4.49, all 4.85; cones 3.99, teddy 4.36, Motorcycle 4.45
       smooth      0: 5.00 (4.31); 0.5: 5.02 (4.25); 0.6: 5.02 (4.27); 0.7: 5.02 (4.45); 0.8: 5.07 (4.64);
                   1.0: 5.12 (5.01)
-      outside     0.3: 5.05 (4.36); 0.5: 5.02 (4.27); 0.7: 5.02 (4.29); 1.0: 5.04 (4.30); None: 5.02 (4.28)
+      border_cost 0.3: 5.05 (4.36); 0.5: 5.02 (4.27); 0.7: 5.02 (4.29); 1.0: 5.04 (4.30); None: 5.02 (4.28)
       smp         False: 5.29 (4.54)
       speckle     0: 5.76 (4.37); 0.0001: 5.04 (4.26); 0.0002: 5.02 (4.27); 0.0003: 5.06 (4.32); 0.0005: 5.12 (4.30);
                   0.001: 5.27 (4.49)
@@ -82,10 +82,10 @@ and Motorcycle (``python -m stereokit_evaluation.commands.search --data DIR --ou
       p1          0.3: 5.09 (4.28); 0.5: 5.03 (4.28); 20/31: 5.02 (4.27); 0.8: 5.02 (4.34); 1.0: 4.97 (4.34)
       p2          2.0: 5.24 (4.17); 3.0: 5.09 (4.22); 120/31: 5.02 (4.27); 5.0: 4.94 (4.34); 6.5: 4.92 (4.40)
 
-What the table does not take: wider rows (sigma_s) and a higher sigma_r help KITTI's roads and blur Middlebury's edges;
-uniqueness helps the domain transform a little and costs time. Five paths are for those who have no memory to spare.
+Beyond the table: wider rows (sigma_s) and a higher sigma_r help KITTI's roads and blur Middlebury's edges; uniqueness
+helps the domain transform a little and costs time. Five paths save memory.
 
-At half size (`HALF`), found in the same way with ``--scale 0.5``: maps are upscaled linearly, and bad-2.0 counts pixels
+At half size (`HALF`), by the same search with ``--scale 0.5``: maps are upscaled linearly, and bad-2.0 counts pixels
 of full size. A pixel is twice as wide there and was smoothed by halving, so that less smoothing and smaller windows
 win on both data sets. Options that are not listed hold as at full size, penalties too: on KITTI no other gains 0.1::
 
@@ -131,11 +131,11 @@ METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+s
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "": {
+        "border_cost": 0.5,
         "confidence": False,
         "fill": "nearest",
         "median": 5,
         "nodata": None,
-        "outside": 0.5,
         "right": False,
         "smooth": 0.6,
         "smp": True,
@@ -148,7 +148,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "zncc+dt": {"smooth": 0.7, "speckle": 0.0003, "window": 3},
     "zncc+sgm": {"p1": 20 / 31, "p2": 120 / 31},
 }
-"""Options by method; those under the empty name hold for all methods that do not say otherwise."""
+"""Options by method; those under the empty name apply to all methods without an entry of their own."""
 
 HALF: dict[str, dict[str, Any]] = {
     "census+dt": {"sigma_s": 14, "sigma_v": 4, "smooth": 0.4},
@@ -156,7 +156,7 @@ HALF: dict[str, dict[str, Any]] = {
     "zncc+dt": {"sigma_s": 14, "sigma_v": 4, "smooth": 0.4},
     "zncc+sgm": {"smooth": 0.4, "window": 3},
 }
-"""What is different where a pair is matched at half size: a pixel is twice as wide there, and smooth already."""
+"""Different options at half size: a pixel is twice as wide there, and smoothed already by halving."""
 
 
 def defaults_of(method: str, *, half: bool = False) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class OptionError(StereokitError):
 
 
 class DeviceError(OptionError):
-    """The device that was asked for is not there, or cannot do what was asked."""
+    """The requested device is not there, or does not support the request."""
 
 
 class UnknownNameError(OptionError):
@@ -44,15 +44,15 @@ class UnknownNameError(OptionError):
 
 
 class FileError(StereokitError):
-    """A file is missing, cannot be read as what it should be, or cannot be written."""
+    """A file is missing, cannot be read in its format, or cannot be written."""
 
 
 class StereokitWarning(UserWarning):
-    """Something that was not refused, but hardly gives what was meant."""
+    """An input or option that is accepted, but probably not intended."""
 
 
 def shown(value: object) -> str:
-    """Return a value as a message shows it: on one line, and not long."""
+    """Return the text of a value for messages: one short line."""
     try:
         text = " ".join(repr(value).split())
     except Exception:  # such as integers of thousands of digits
@@ -61,14 +61,14 @@ def shown(value: object) -> str:
 
 
 def did_you_mean(kind: str, name: object, known: Iterable[str]) -> str:
-    """Return the line that says that no `kind` is called `name`, with the nearest known name.
+    """Return the message for a `name` that no `kind` has, with the nearest known name.
 
     Parameters
     ----------
     kind : str
-        What was looked for, such as ``"cost"``.
+        The kind of thing, such as ``"cost"``.
     name : object
-        The name that was asked for, or whatever came instead of one.
+        The unknown name, or another value in its place.
     known : iterable of str
         The names that exist.
     """
@@ -79,15 +79,15 @@ def did_you_mean(kind: str, name: object, known: Iterable[str]) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return `text` as something that can be printed anywhere, on one line.
+    """Return `text` as one printable line.
 
-    Runs of white space become one blank; control characters, and what stands for the bytes of a file name that is no
+    Runs of white space become one blank. Control characters, and surrogates for bytes of a file name that are not
     UTF-8, are written as escapes.
 
     Parameters
     ----------
     text : str
-        Such as a path, or the message of a library.
+        For example a path, or the message of a library.
     """
     words = " ".join(text.split())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.aggregation.contract import Aggregation
-from stereokit.checks import doubts, doubts_about_density
+from stereokit.checks import PairWatch
 from stereokit.costs.rows import Cost
 from stereokit.cuda.driver import require_device
 from stereokit.defaults import METHODS
@@ -27,11 +27,14 @@ from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
-from stereokit.pipeline import CpuPipeline, Pipeline
+from stereokit.options import MatchOptions, StageOptions, WarmupOptions
+from stereokit.pipeline import CpuPipeline, Pipeline, concluded, with_blank
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from stereokit.cuda.pipeline import DeviceDisparity
 
 __all__ = ["METHODS", "Matcher", "match", "warmup"]
@@ -45,14 +48,14 @@ class Matcher:
     method : str
         ``"cost+aggregation"`` or S1 to S4, any case; the default, S2, is the fastest and most accurate of the four.
     max_disparity, min_disparity : int
-        Disparities ``min_disparity <= d < max_disparity`` are tried, in full-size pixels. The minimum may be
+        Disparities ``min_disparity <= d < max_disparity`` are searched, in full-size pixels. The minimum may be
         negative. 1 to 2048 levels.
     scale : {1.0, 0.5, 0.25}
         0.5 and 0.25 match at half and at a quarter of the size, and let `refiner` bring the map to full size.
     refiner : str, callable or None
         The name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
         `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones need
-        ``stereokit[fast]``; those other than ``"general"`` need ``scale=0.5``.
+        ``stereokit[refiners]``; those other than ``"general"`` need ``scale=0.5``.
     device : {"auto", "cpu", "cuda"}
         Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``. "auto" is the CPU
         for now, with a GPU too: the kernels are tested in an interpreter and have not run on a GPU yet. Refiners run
@@ -67,11 +70,11 @@ class Matcher:
         ``subpixel``, and of the pipeline: ``smooth`` (sigma in pixels of a Gaussian on both images before matching),
         ``uniqueness`` (percent by which the best rival must cost more, or the pixel is invalid), ``smp`` (bool,
         single matching phase), ``speckle`` (largest region of like disparity that is removed, as a share of the
-        image), ``median`` (0, 3 or 5), ``outside`` (cost of matches outside the right image as a share of the cost's
-        range, or None for the nearest border pixel), ``nodata`` (value of pixels that hold nothing, which match nothing
-        and are never ``valid``; None leaves it to NaN, alpha and what `stereokit.images.intensity` sees by itself),
-        ``confidence`` (bool) and ``right`` (bool, the right view's map too; twice the time). Defaults are those of
-        `stereokit.defaults`.
+        image), ``median`` (0, 3 or 5), ``border_cost`` (cost of matches outside the right image as a share of the
+        cost's range, or None for the nearest border pixel; its old name is ``outside``), ``nodata`` (value of pixels
+        without evidence, which match nothing and are never ``valid``; None leaves it to NaN, alpha and the marks that
+        `stereokit.images.intensity` detects), ``confidence`` (bool) and ``right`` (bool, the right view's map too;
+        twice the time). Defaults are those of `stereokit.defaults`.
 
     Raises
     ------
@@ -93,7 +96,7 @@ class Matcher:
     def __init__(
         self, method: str = "census+sgm", *, max_disparity: int = 128, min_disparity: int = 0, scale: float = 1.0,
         refiner: str | Callable[..., Disparity] | None = None, device: str = "auto", threads: int | None = None,
-        **options: Any,
+        **options: Unpack[StageOptions],
     ) -> None:  # fmt: skip
         if not isinstance(device, str) or device not in ("auto", "cpu", "cuda"):
             raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {shown(device)}")
@@ -106,9 +109,10 @@ class Matcher:
             min_disparity=min_disparity,
             scale=scale,
             refiner=refiner,
-            options=options,
+            options={**options},
         )
         self._pipeline: Pipeline = _pipeline(settings, device)
+        self._watch = PairWatch()
 
     @property
     def settings(self) -> MatchSettings:
@@ -122,17 +126,17 @@ class Matcher:
 
     @property
     def min_disparity(self) -> int:
-        """The smallest disparity that is tried, full-size pixels."""
+        """The smallest disparity of the search, full-size pixels."""
         return self.settings.levels.minimum
 
     @property
     def max_disparity(self) -> int:
-        """All disparities that are tried are below this, full-size pixels."""
+        """The upper bound of the search, exclusive, full-size pixels."""
         return self.settings.levels.minimum + self.settings.levels.count
 
     @property
     def scale(self) -> float:
-        """1, or 0.5 or 0.25 where is matched at a smaller size."""
+        """The size of the matching: 1, 0.5 or 0.25."""
         return self.settings.scale
 
     @property
@@ -161,21 +165,21 @@ class Matcher:
         return "cpu" if isinstance(self._pipeline, CpuPipeline) else "cuda"
 
     def identity(self) -> dict[str, Any]:
-        """Return what a map depends on beside the images, as plain values, fit for JSON.
+        """Return everything a map depends on, except the images, as plain values, fit for JSON.
 
-        Neither `device` nor `threads` is among them. Refiners are told apart by their ``fingerprint``.
+        Neither `device` nor `threads` is among them. The ``fingerprint`` of a refiner identifies its weights.
         """
         return self.settings.identity()
 
     def replaced(self, **changes: Any) -> Matcher:
         """Return a matcher that differs in some of its `settings`, by their names."""
-        changed = Matcher.__new__(Matcher)
-        changed.threads = self.threads
-        changed._pipeline = self._pipeline.replaced(**changes)
-        return changed
+        matcher = Matcher.__new__(Matcher)
+        matcher.threads = self.threads
+        matcher._pipeline = self._pipeline.replaced(**changes)
+        return matcher
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
-        """Return how many bytes of buffers a pair takes; see `stereokit.pipeline.Pipeline`."""
+        """Return the bytes of the buffers for a pair; see `stereokit.pipeline.Pipeline`."""
         return self._pipeline.nbytes(height, width, dtype)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -186,6 +190,7 @@ class Matcher:
         if state["device"] == "cuda":
             require_device()
         self._pipeline = _pipeline(state["settings"], state["device"])
+        self._watch = PairWatch()
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
@@ -224,7 +229,7 @@ class Matcher:
         result: DeviceDisparity = pipeline.match_on_device(left, right, stream)
         return result
 
-    def __call__(self, left: Any, right: Any) -> Disparity:
+    def __call__(self, left: Any, right: Any, *, mask: Any = None, right_mask: Any = None) -> Disparity:
         """Match a rectified pair.
 
         Parameters
@@ -232,35 +237,39 @@ class Matcher:
         left, right : (H, W), (H, W, 3) or (H, W, 4), numbers
             Grey, RGB or RGBA, of one size and type; never modified. One may be grey and the other in colour: both are
             matched in grey. Pixels that are NaN, infinite, `nodata`, of alpha 0 or evident marks such as -3.4e38
-            count as no evidence.
+            have no evidence; nor have black borders, as rectification leaves them.
+        mask, right_mask : (H, W) bool, optional
+            True where a pixel of the left, and of the right image is usable. The others have no evidence.
 
         Returns
         -------
         Disparity
-            Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, if asked for,
-            ``confidence`` and the ``right`` view's map. Where no pixel at all could be measured (blank images),
-            a filled map is `min_disparity` everywhere.
+            Map of the left view, ``float32`` ``(H, W)`` in pixels, with ``valid`` and, on request,
+            ``confidence`` and the ``right`` view's map. Pixels without evidence are NaN, also where the rest is filled.
+            Where no pixel at all could be measured (blank images), a filled map is `min_disparity` everywhere.
 
         Warns
         -----
         PairWarning
-            If both images are the same, or hardly anything could be measured; see `stereokit.checks`.
+            If the pair looks as if it were not rectified, exchanged, given twice or out of range; see
+            `stereokit.check_pair`, which tells more.
         StereokitWarning
             If few grey levels hold nearly all pixels of images of more than 8 bits.
 
         Raises
         ------
         InputError
-            If the images cannot be used.
+            If the images or a mask cannot be used.
         """
-        found = self._call(left, right, self.threads)
-        for line in doubts(left, right, found, self.min_disparity, self.max_disparity):
+        result, lines = self._call(left, right, mask, right_mask, self.threads)
+        for line in lines:
             warn(line, PairWarning)
-        return found
+        return result
 
     def map(
-        self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None
-    ) -> Iterator[Disparity]:
+        self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None,
+        mask: Any = None, right_mask: Any = None,
+    ) -> Iterator[Disparity]:  # fmt: skip
         """Match a sequence of pairs, several frames at a time, one thread each.
 
         Frames in parallel use the processors better than threads within a frame, and any number of them. The
@@ -273,6 +282,8 @@ class Matcher:
             that memory stays bounded however long the sequence is.
         progress : callable or None
             Called with the number of results so far, after each.
+        mask, right_mask : (H, W) bool, optional
+            Usable pixels of all left, and of all right images.
 
         Yields
         ------
@@ -281,22 +292,22 @@ class Matcher:
         Warns
         -----
         PairWarning
-            At the first pair of which hardly anything could be measured.
+            At the first pair that looks wrong.
 
         Raises
         ------
         InputError
             When the turn comes of a pair that cannot be used.
         """
-        ahead: deque[Job[Disparity]] = deque()
+        queue: deque[Job[tuple[Disparity, list[str]]]] = deque()
         source = iter(pairs)
-        # On a GPU each worker has buffers of its own there.
+        # On a GPU each worker has its own buffers.
         workers = Workers(self.threads if self.device == "cpu" else min(2, self.threads))
         try:
-            doubted = False
-            failure: Exception | None = None  # of the source: what it gave before is still matched
-            for done in itertools.count(1):
-                while failure is None and len(ahead) < 2 * self.threads:
+            has_warned = False
+            failure: Exception | None = None  # of the source; the pairs before it are still matched
+            for count in itertools.count(1):
+                while failure is None and len(queue) < 2 * self.threads:
                     try:
                         pair = next(source)
                         left, right = pair
@@ -305,44 +316,62 @@ class Matcher:
                     except Exception as error:
                         failure = error
                     else:
-                        ahead.append(Job(self._call, left, right, 1))
-                        workers.submit(ahead[-1])
-                if not ahead:
+                        queue.append(Job(self._call, left, right, mask, right_mask, 1))
+                        workers.submit(queue[-1])
+                if not queue:
                     if isinstance(failure, StopIteration):
                         return
                     assert failure is not None
                     raise failure
-                result = ahead[0].result()
-                ahead.popleft()
-                for line in doubts_about_density(result.density, self.min_disparity, self.max_disparity):
-                    if not doubted:
-                        warn(f"pair {done - 1}: {line}", PairWarning)
-                    doubted = True
+                result, lines = queue[0].result()
+                queue.popleft()
+                for line in lines:
+                    if not has_warned:
+                        warn(f"pair {count - 1}: {line}", PairWarning)
+                    has_warned = True
                 yield result
                 if progress is not None:
-                    progress(done)
+                    progress(count)
         finally:
-            for job in ahead:
+            for job in queue:
                 job.withdraw()
             workers.close()
 
-    def _call(self, left: Any, right: Any, threads: int) -> Disparity:
+    def _call(self, left: Any, right: Any, mask: Any, right_mask: Any, threads: int) -> tuple[Disparity, list[str]]:
+        """Match a pair; return the map and the warnings about them."""
         with span("prepare", "checks and grey"):
-            pair = gray_pair(left, right, self.settings.nodata)
-        return self.match_gray(pair, threads)
+            pair = gray_pair(left, right, self.settings.nodata, mask, right_mask)
+        result = self.match_gray(pair, threads)
+        with span("clean", "signs of a bad pair"):
+            lines = self._watch.warnings(pair, result, self.min_disparity, self.max_disparity)
+        return result, lines
 
-    def match_gray(self, pair: GrayPair, threads: int) -> Disparity:
-        """Match a pair that was checked and is grey."""
-        full = self._pipeline.match(pair, threads)
+    def match_gray(self, pair: GrayPair, threads: int, keeps_blank: bool | None = None) -> Disparity:
+        """Match a pair that was checked and is grey.
+
+        Parameters
+        ----------
+        pair : GrayPair
+        threads : int
+        keeps_blank : bool or None
+            Whether pixels without texture keep the value that their neighbours gave them, although they do not count as
+            measured; None asks whether the map is filled.
+        """
+        keeps = self.settings.fill is not None if keeps_blank is None else keeps_blank
+        full = self._match_view(pair, threads, keeps)
         if not self.settings.right:
             return full
-        mirrored = self._pipeline.match(_mirror(pair), threads)
+        mirrored = self._match_view(_mirror(pair), threads, keeps)
         other = np.ascontiguousarray(mirrored.disparity[:, ::-1])
         return Disparity(full.disparity, full.valid, full.confidence, other)
 
+    def _match_view(self, pair: GrayPair, threads: int, keeps_blank: bool) -> Disparity:
+        pair = with_blank(pair, self.settings)
+        return concluded(self._pipeline.match(pair, threads), pair, keeps_blank)
+
 
 def _pipeline(settings: MatchSettings, device: str) -> Pipeline:
-    """Return the way through the CPU or the GPU; "auto" is the CPU until the kernels have run on a GPU."""
+    """Return the pipeline of the CPU or the GPU; "auto" is the CPU until the kernels have run on a GPU."""
     if device != "cuda":
         return CpuPipeline(settings)
     from stereokit.cuda.pipeline import CudaPipeline  # numba.cuda is imported late
@@ -368,8 +397,14 @@ _matchers: dict[Any, Matcher] = {}
 _matchers_lock = threading.Lock()
 
 
-def match(left: Any, right: Any, /, method: str = "census+sgm", **options: Any) -> NDArray[np.float32]:
+def match(
+    left: Any, right: Any, /, method: str = "census+sgm", *, mask: Any = None, right_mask: Any = None,
+    **options: Unpack[MatchOptions],
+) -> NDArray[np.float32]:  # fmt: skip
     """Match a rectified pair and return the left view's disparity map.
+
+    The map is **filled**: where nothing was measured it holds what its surroundings make likely. ``fill=None`` leaves
+    NaN there, and `Matcher` tells which is which.
 
     Parameters
     ----------
@@ -377,36 +412,40 @@ def match(left: Any, right: Any, /, method: str = "census+sgm", **options: Any) 
         Rectified images of one size and type, grey, RGB or RGBA.
     method : str
         ``"cost+aggregation"`` or S1 to S4.
+    mask, right_mask : (H, W) bool, optional
+        True where a pixel of the left, and of the right image is usable.
     **options
         Those of `Matcher`, but ``right``: this returns the left view's map alone.
 
     Returns
     -------
     (H, W) float32, pixels
-        Dense, unless ``fill=None``, which leaves NaN where nothing was measured.
+        Dense but for pixels without evidence (see `Matcher`), which are NaN; with ``fill=None`` all that was not
+        measured is.
 
     Raises
     ------
     InputError, OptionError
         If an image or an option cannot be used.
     """
-    if options.pop("right", False) is not False:
+    values: dict[str, Any] = {**options}
+    if values.pop("right", False) is not False:
         raise OptionError("right must be False here, where only the left view's map is returned; see Matcher")
     try:
-        key = (method, tuple((name, type(options[name]), _version(options[name])) for name in sorted(options)))
+        key = (method, tuple((name, type(values[name]), _file_version(values[name])) for name in sorted(values)))
         hash(key)
     except TypeError:
-        return Matcher(method, **options)(left, right).disparity
+        return Matcher(method, **values)(left, right, mask=mask, right_mask=right_mask).disparity
     with _matchers_lock:
-        matcher = _matchers.pop(key, None) or Matcher(method, **options)
+        matcher = _matchers.pop(key, None) or Matcher(method, **values)
         _matchers[key] = matcher  # the most recently used is last
         while len(_matchers) > 4:
             _matchers.pop(next(iter(_matchers)))
-    return matcher(left, right).disparity
+    return matcher(left, right, mask=mask, right_mask=right_mask).disparity
 
 
-def _version(option: Any) -> Any:
-    """Return an option with what tells one content of a weight file from the next, where it is the path of one."""
+def _file_version(option: Any) -> Any:
+    """Return an option; for the path of a weight file with the file's time, size and inode, which tell its versions."""
     if isinstance(option, (str, os.PathLike)) and os.fspath(option).endswith(".safetensors"):
         try:
             status = os.stat(option)
@@ -416,8 +455,8 @@ def _version(option: Any) -> Any:
     return option
 
 
-def warmup(*methods: str, max_disparity: int = 128) -> None:
-    """Compile ahead (or load from the disk cache) what the methods need, so that no later call waits for it.
+def warmup(*methods: str, max_disparity: int = 128, **options: Unpack[WarmupOptions]) -> None:
+    """Compile the kernels of the methods (or load them from the disk cache), so that no later call waits for it.
 
     Parameters
     ----------
@@ -425,17 +464,25 @@ def warmup(*methods: str, max_disparity: int = 128) -> None:
         Methods; none means S1 to S4.
     max_disparity : int
         As it will be used: code is compiled per 64 levels.
+    **options
+        Those of `Matcher`, as they will be used.
+
+    Raises
+    ------
+    OptionError
+        If an option cannot be used.
     """
-    image = np.arange(16 * 16, dtype=np.uint8).reshape(16, 16)
+    values: dict[str, Any] = {**options, "max_disparity": max_disparity}
+    image = np.arange(64 * 64, dtype=np.uint16).astype(np.uint8).reshape(64, 64)
     for method in methods or METHODS:
         with collecting():
-            Matcher(method, max_disparity=max_disparity)(image, image)
+            Matcher(method, **values)(image, image)
 
 
 def _forget_matchers() -> None:
     global _matchers_lock
     _matchers.clear()
-    _matchers_lock = threading.Lock()  # the old one may be held by a thread that the child does not have
+    _matchers_lock = threading.Lock()  # the owner of the old one may be a thread that the child does not have
 
 
 if hasattr(os, "register_at_fork"):  # buffers of a call that was under way stay with the parent

@@ -19,13 +19,22 @@ from stereokit.errors import OptionError, UnknownNameError, did_you_mean, shown
 from stereokit.images.check import MAX_DISPARITY, check_integer, check_names
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 
-__all__ = ["build_aggregation", "build_cost", "check_levels", "find_refiner", "option_names", "parse_method"]
+__all__ = [
+    "build_aggregation",
+    "build_cost",
+    "check_levels",
+    "current_names",
+    "find_refiner",
+    "option_names",
+    "parse_method",
+]
 
 _MAX_LEVELS = 2048
+_OLD_NAMES = {"outside": "border_cost"}
 
 
 def parse_method(method: str) -> str:
-    """Return the canonical name, ``"cost+aggregation"``, of a method given in any case, or as S1 to S4.
+    """Return the canonical name, ``"cost+aggregation"``, of a method in any case, or of S1 to S4.
 
     Raises
     ------
@@ -45,6 +54,14 @@ def parse_method(method: str) -> str:
     return "+".join(parts)
 
 
+def current_names(options: dict[str, Any]) -> dict[str, Any]:
+    """Return options under their present names; raise OptionError for one that has both its old and its new name."""
+    for old, new in _OLD_NAMES.items():
+        if old in options and new in options:
+            raise OptionError(f"{old} is the old name of {new}, got both")
+    return {_OLD_NAMES.get(name, name): value for name, value in options.items()}
+
+
 def check_levels(min_disparity: Any, max_disparity: Any) -> Levels:
     """Return the levels ``min_disparity <= d < max_disparity``; raise OptionError if there are none or too many."""
     low = check_integer("min_disparity", min_disparity, -MAX_DISPARITY, MAX_DISPARITY)
@@ -57,7 +74,7 @@ def check_levels(min_disparity: Any, max_disparity: Any) -> Levels:
 def build_cost(name: Any, options: dict[str, Any]) -> Any:
     """Return the cost called `name` with `options`; raise OptionError for those that it does not have.
 
-    A cost that is given itself is returned as it is.
+    A cost object in place of a name is returned as it is.
     """
     if hasattr(name, "prepare") and not isinstance(name, type) and not options:
         return name
@@ -75,7 +92,7 @@ def _build(kind: str, factory: Any, options: dict[str, Any]) -> Any:
 
 
 def find_refiner(refiner: Any) -> tuple[str, Callable[..., Any], list[str]]:
-    """Return the name of a refiner, what makes it, and the names of its options.
+    """Return the name of a refiner, its factory, and the names of its options.
 
     Parameters
     ----------

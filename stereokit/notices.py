@@ -1,8 +1,8 @@
-"""What is worth knowing but stops nothing: warnings, raised in one place.
+"""Warnings, raised in one place.
 
-In Python they are warnings of the standard library, and the filters of `warnings` apply. Who has a better place for
-them, such as a command with a line to print or a batch with a report to fill, takes them with `collecting`; each thread
-does so for itself.
+In Python they are warnings of the standard library, and the filters of `warnings` apply. A caller with a better place
+for them, such as a command that prints lines or a batch with a report, collects them with `collecting`; each thread
+collects its own.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ class PairWarning(StereokitWarning):
     """The two images do not look like a rectified pair, left and right."""
 
 
-_taker: ContextVar[Callable[[str], object] | None] = ContextVar("stereokit_notices", default=None)
+_handler: ContextVar[Callable[[str], object] | None] = ContextVar("stereokit_notices", default=None)
 
 
 def warn(message: str, category: type[StereokitWarning] = StereokitWarning) -> None:
-    """Hand `message`, one line, to who collects in this thread; where nobody does, warn where the package was called.
+    """Add `message`, one line, to the collection of this thread; without one, warn at the call of the package.
 
     Parameters
     ----------
@@ -34,20 +34,20 @@ def warn(message: str, category: type[StereokitWarning] = StereokitWarning) -> N
     category : type
         Of the warning.
     """
-    taker = _taker.get()
-    if taker is None:
+    handler = _handler.get()
+    if handler is None:
         warnings.warn(message, category, stacklevel=_outside())
     else:
-        taker(message)
+        handler(message)
 
 
 @contextmanager
-def collecting(taker: Callable[[str], object] | None = None) -> Iterator[list[str]]:
+def collecting(handler: Callable[[str], object] | None = None) -> Iterator[list[str]]:
     """Collect the warnings of this thread for the length of a ``with`` block.
 
     Parameters
     ----------
-    taker : callable or None
+    handler : callable or None
         Called with each line, the first time that it comes.
 
     Yields
@@ -57,17 +57,17 @@ def collecting(taker: Callable[[str], object] | None = None) -> Iterator[list[st
     """
     lines: list[str] = []
 
-    def take(line: str) -> None:
+    def collect(line: str) -> None:
         if line not in lines:
             lines.append(line)
-            if taker is not None:
-                taker(line)
+            if handler is not None:
+                handler(line)
 
-    token = _taker.set(take)
+    token = _handler.set(collect)
     try:
         yield lines
     finally:
-        _taker.reset(token)
+        _handler.reset(token)
 
 
 def _outside() -> int:

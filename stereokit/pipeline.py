@@ -1,18 +1,20 @@
-"""What every way from a pair to a map offers, and the one through the CPU.
+"""The protocol of pipelines from a pair to a map, and the pipeline of the CPU.
 
-A pipeline is made of `stereokit.settings.MatchSettings` and keeps nothing but buffers between calls; it may be used by
-many threads at the same time. The way through the GPU is `stereokit.cuda.pipeline.CudaPipeline`.
+A pipeline is built from `stereokit.settings.MatchSettings`. Its only state between calls is its buffers; many threads
+may use it at the same time. The pipeline of the GPU is `stereokit.cuda.pipeline.CudaPipeline`.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Pair, takes_8_bits
+from stereokit.costs.rows import CostInput, takes_8_bits
 from stereokit.errors import OptionError
+from stereokit.images.evidence import blank_pixels, joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
 from stereokit.images.resize import reduced, smooth
@@ -21,13 +23,13 @@ from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.chain import post_process
 from stereokit.result import Disparity
-from stereokit.selection.wta import winners_like
+from stereokit.selection.wta import selection_output
 from stereokit.settings import Detail, MatchSettings
 
-__all__ = ["CpuPipeline", "Pipeline", "refined"]
+__all__ = ["CpuPipeline", "Pipeline", "concluded", "refined", "with_blank"]
 
 _PROBES = (256, 512)
-"""Sides of the windows that are matched to see how buffers grow, pixels."""
+"""Sides of the images that are matched to measure the growth of the buffers, pixels."""
 
 
 class Pipeline(Protocol):
@@ -35,7 +37,7 @@ class Pipeline(Protocol):
 
     @property
     def settings(self) -> MatchSettings:
-        """All that a map depends on beside the images."""
+        """Everything a map depends on, except the images."""
 
     def match(self, pair: GrayPair, threads: int) -> Disparity:
         """Match a checked pair.
@@ -50,14 +52,14 @@ class Pipeline(Protocol):
         Returns
         -------
         Disparity, (H, W)
-            Refined, where a refiner was asked for; without the right view's map.
+            Refined, where the settings have a refiner; without the right view's map.
         """
 
     def replaced(self, **changes: Any) -> Pipeline:
         """Return a pipeline of the same kind whose settings differ in some values."""
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
-        """Return how many bytes of buffers the matching of a pair takes, beside images, maps and the refiner.
+        """Return the bytes of the buffers for a pair, without images, maps and the refiner.
 
         Parameters
         ----------
@@ -69,7 +71,7 @@ class Pipeline(Protocol):
 
 
 def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads: int) -> Disparity:
-    """Return the map that a pipeline hands out: at full size, without what only the refiner wanted.
+    """Return the final map of a pipeline: at full size, without the outputs that only the refiner needed.
 
     Raises
     ------
@@ -78,17 +80,19 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     """
     if settings.refiner is None:
         return coarse
-    further: dict[str, Any] = {}
+    keywords: dict[str, Any] = {}
     if getattr(settings.refiner, "any_scale", False):
-        further["scale"] = settings.scale
+        keywords["scale"] = settings.scale
     if getattr(settings.refiner, "needs_right", False):
-        further["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
+        keywords["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
     with span("refine", "refine"):
-        full = settings.refiner(coarse, pair.guide, threads=threads, **further)
+        full = settings.refiner(coarse, pair.guide, threads=threads, **keywords)
     if not isinstance(full, Disparity) or full.disparity.shape != pair.guide.shape:
-        got = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
+        received = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
         size = pair.guide.shape
-        raise OptionError(f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {got}")
+        raise OptionError(
+            f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {received}"
+        )
     disparity = full.disparity
     if getattr(settings.refiner, "needs_right", False):  # it measures for itself, and may leave the range
         levels = settings.levels
@@ -98,8 +102,49 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 
+def with_blank(pair: GrayPair, settings: MatchSettings) -> GrayPair:
+    """Return the pair with its blank pixels: those around which the left view has no texture as far as a match looks.
+
+    Parameters
+    ----------
+    pair : GrayPair
+        At full size.
+    settings : MatchSettings
+        Of whose cost the window counts, of whose smoothing the kernel, and the size of the matching. Costs that do not
+        say how far they look have no blank pixels.
+    """
+    if settings.reach is None or pair.left_blank is not None:
+        return pair
+    with span("prepare", "blank pixels"):
+        return replace(pair, left_blank=blank_pixels(pair.left, *settings.reach))
+
+
+def concluded(result: Disparity, pair: GrayPair, keeps_blank: bool = True) -> Disparity:
+    """Return a map that says nothing of pixels without evidence, and calls no blank pixel measured.
+
+    Parameters
+    ----------
+    result : Disparity
+        At full size.
+    pair : GrayPair
+    keeps_blank : bool
+        Whether blank pixels keep the value that their neighbours gave them.
+    """
+    bad, blank = pair.left_bad, pair.left_blank
+    unmeasured = joined(bad, blank)
+    if unmeasured is None:
+        return result
+    parts: dict[str, Any] = {"disparity": result.disparity, "valid": result.valid & ~unmeasured}
+    empty = bad if keeps_blank else unmeasured
+    if empty is not None:
+        parts["disparity"] = np.where(empty, np.float32(np.nan), result.disparity)
+    if result.confidence is not None:
+        parts["confidence"] = np.where(unmeasured, np.float32(0), result.confidence)
+    return replace(result, **parts)
+
+
 class CpuPipeline:
-    """The way through the CPU.
+    """The pipeline of the CPU.
 
     Parameters
     ----------
@@ -118,7 +163,7 @@ class CpuPipeline:
         return refined(self.settings, coarse, pair, threads)
 
     def _coarse(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
-        """Return the map of the size at which is matched."""
+        """Return the map at the size of the matching."""
         settings = self.settings
         cost, aggregation, levels = settings.cost, settings.aggregation, settings.matched_levels
         if settings.scale != 1:
@@ -129,8 +174,15 @@ class CpuPipeline:
         shape = pair.left.shape
         with span("prepare", "prepare cost"):
             rows = cost.prepare(
-                Pair(
-                    pair.left, pair.right, pair.left_bad, pair.right_bad, levels, settings.outside, threads, pair.ranges
+                CostInput(
+                    pair.left,
+                    pair.right,
+                    joined(pair.left_bad, pair.left_blank),
+                    pair.right_bad,
+                    levels,
+                    settings.border_cost,
+                    threads,
+                    pair.ranges,
                 ),
                 workspace,
                 max(2, threads),
@@ -139,7 +191,7 @@ class CpuPipeline:
         total = workspace.array("match.cost", shape, aggregation.total_dtype)
         confidence = np.empty(shape, np.float32) if settings.detail >= Detail.CONFIDENCE else None
         candidates = np.empty((2, *shape), np.float32) if settings.detail >= Detail.CANDIDATES else None
-        out = winners_like(
+        out = selection_output(
             disparity, total, confidence, levels.count, levels.minimum, settings.subpixel, settings.uniqueness,
             candidates,
         )  # fmt: skip
@@ -148,6 +200,8 @@ class CpuPipeline:
         with span("clean", "post-processing"):
             chain = settings.post_processing(disparity.size)
             disparity, valid = post_process(disparity, total, pair.left_bad, chain, workspace, threads)
+            if pair.left_blank is not None:
+                valid &= ~pair.left_blank
             if confidence is not None:
                 confidence[~valid] = 0
         return Disparity(disparity, valid, confidence, candidates=candidates)
@@ -157,7 +211,7 @@ class CpuPipeline:
         return CpuPipeline(self.settings.replaced(**changes))
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
-        """Return how many bytes of buffers a pair takes; see `Pipeline`. Found by matching four small pairs."""
+        """Return the bytes of the buffers for a pair; see `Pipeline`. Measured on four small pairs."""
         dtype = np.dtype(dtype)
         if dtype not in self._growth:
             sizes = [(rows, columns) for rows in _PROBES for columns in _PROBES]
@@ -167,7 +221,7 @@ class CpuPipeline:
         return float(self._growth[dtype] @ (1, height, width, height * width))
 
     def _buffer_nbytes(self, height: int, width: int, dtype: Any) -> int:
-        """Return the bytes of the buffers of one match, which is made for it."""
+        """Return the bytes of the buffers of one match, after matching a made-up pair."""
         image = (np.arange(height * width, dtype=np.uint32) * 2654435761 >> 16).astype(dtype).reshape(height, width)
         workspace = Workspace()
         self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, 1)

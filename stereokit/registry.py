@@ -1,6 +1,6 @@
-"""Named stages: costs, aggregations and refiners are found by name, plug-ins through entry points.
+"""Tables of stages by name: costs, aggregations and refiners, with plug-ins from entry points.
 
-Listing names imports nothing; a plug-in is imported when it is first asked for.
+Listing names imports nothing; a plug-in is imported at its first use.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Registry(Generic[T]):
         self._items: dict[str, T] = {}
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Return a decorator that adds what it decorates under `name` (any case, no ``+``).
+        """Return a decorator that registers its object under `name` (any case, no ``+``).
 
         Raises
         ------
@@ -53,7 +53,7 @@ class Registry(Generic[T]):
         return add
 
     def get(self, name: str) -> T:
-        """Return what is registered under `name`, importing its plug-in if it comes from one.
+        """Return the stage of that name, importing its plug-in if it comes from one.
 
         Raises
         ------

@@ -1,7 +1,7 @@
-"""What a matcher returns: the disparity map, what was measured in it, how sure it is, and what to do with it.
+"""The result of a matcher: the disparity map with its valid pixels and confidence, and its depth, points and colours.
 
 The colours are Google's Turbo map (Mikhailov 2019, as in OpenCV): it runs from dark blue (far) to dark red
-(near) without the false edges of a rainbow, and black is left for pixels without a value.
+(near) without the false edges of a rainbow. Pixels without a value are black.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereokit import io
 from stereokit.calibration import Calibration
 from stereokit.errors import InputError, OptionError
+from stereokit.images.check import check_flag, check_number
 
 __all__ = ["Disparity", "color_range", "colorize"]
 
@@ -29,7 +30,8 @@ class Disparity:
     Parameters
     ----------
     disparity : (H, W) float32
-        Pixels, NaN where invalid. Dense after a fill.
+        Pixels, NaN where invalid. **Filled** unless the matcher has ``fill=None``: then what was not measured holds
+        what its surroundings make likely. `measured` has NaN there.
     valid : (H, W) bool
         True where the disparity was measured, False where it was filled or is invalid.
     confidence : (H, W) float32, optional
@@ -37,9 +39,8 @@ class Disparity:
     right : (H, W) float32, optional
         The map of the right view, pixels, NaN where invalid.
     candidates : (2, H, W) float32, optional
-        Disparities that the aggregated costs alone are in favour of, pixels: the best, before any check, filter or
-        fill, and the best of those that are not next to it, or the best again where there is none. Refiners that ask
-        for them get them.
+        The two disparities of lowest aggregated cost, pixels, before any check, filter or fill: the best, and the best
+        of those that are not next to it, or the best again where there is none. Only for refiners that need them.
 
     Raises
     ------
@@ -85,21 +86,105 @@ class Disparity:
             f"Disparity({height}x{width}, {span}, {100 * self.density:.1f} % measured{''.join(f', {m}' for m in more)})"
         )
 
+    def _repr_png_(self) -> bytes:
+        """Return the map in colours, as notebooks show it."""
+        good, data = cv2.imencode(".png", self.color()[:, :, ::-1])
+        assert good
+        return data.tobytes()
+
+    @property
+    def measured(self) -> NDArray[np.float32]:
+        """The map of what was measured alone, (H, W) float32 in pixels: NaN where a value was filled in, or is missing.
+
+        `disparity` is filled by default; this is not.
+        """
+        return np.where(self.valid, self.disparity, np.float32(np.nan))
+
     @property
     def density(self) -> float:
         """The share of pixels that were measured, from 0 to 1."""
         return float(np.count_nonzero(self.valid) / self.valid.size)
 
-    def depth(self, calibration: Calibration) -> NDArray[np.float32]:
+    def depth(
+        self, calibration: Calibration, *, filled: bool = False, max_depth: float | None = None
+    ) -> NDArray[np.float32]:
         """Return the depth, (H, W) float32 in metres, NaN where there is none.
 
-        Filled pixels have a depth too; mask with `valid` to keep measured ones only.
-        """
-        return calibration.disparity_to_depth(self.disparity)
+        Parameters
+        ----------
+        calibration : Calibration
+        filled : bool
+            Also of pixels that were not measured but filled.
+        max_depth : float or None
+            Metres beyond which there is none.
 
-    def points(self, calibration: Calibration) -> NDArray[np.float32]:
-        """Return the points in the left camera's frame, (H, W, 3) float32 metres, NaN where there is none."""
-        return calibration.points(self.disparity)
+        Raises
+        ------
+        InputError
+            If the calibration is for maps of another size.
+        OptionError
+            If `max_depth` is not positive.
+        """
+        return calibration.disparity_to_depth(self._kept(calibration, filled, max_depth))
+
+    def points(
+        self, calibration: Calibration, *, filled: bool = False, max_depth: float | None = None, frame: str = "optical"
+    ) -> NDArray[np.float32]:
+        """Return the points in a frame of the left camera, (H, W, 3) float32 metres, NaN where there is none.
+
+        Parameters
+        ----------
+        calibration : Calibration
+        filled, max_depth
+            As of `depth`.
+        frame : {"optical", "y-up", "ros"}
+            See `stereokit.calibration.FRAMES`.
+
+        Raises
+        ------
+        InputError
+            If the calibration is for maps of another size.
+        OptionError
+            If `max_depth` is not positive, or there is no such frame.
+        """
+        return calibration.points(self._kept(calibration, filled, max_depth), frame)
+
+    def _kept(self, calibration: Calibration, filled: bool, max_depth: float | None) -> NDArray[np.float32]:
+        """Return the map of the pixels that have a depth for the user."""
+        disparity = self.disparity if check_flag("filled", filled) else self.measured
+        if max_depth is None:
+            return disparity
+        farthest = check_number("max_depth", max_depth, 0, np.inf)
+        if farthest == 0:
+            raise OptionError("max_depth must be positive, got 0")
+        depth = calibration.disparity_to_depth(disparity)
+        return np.where(depth <= farthest, disparity, np.float32(np.nan))
+
+    def save_depth(
+        self, path: str | os.PathLike[str], calibration: Calibration, *, filled: bool = False,
+        max_depth: float | None = None,
+    ) -> None:  # fmt: skip
+        """Write the depth as ``.png`` (16-bit millimetres, 0 for none), ``.tiff`` or ``.npy`` (float32 metres, NaN).
+
+        See `stereokit.io.write_depth`. Only what was measured is written, unless `filled` is True.
+
+        Parameters
+        ----------
+        path : path
+        calibration : Calibration
+        filled, max_depth
+            As of `depth`.
+
+        Raises
+        ------
+        InputError
+            If the calibration is for maps of another size.
+        OptionError
+            If `max_depth` is not positive.
+        FileError
+            If the suffix is unknown or the file cannot be written.
+        """
+        io.write_depth(path, self.depth(calibration, filled=filled, max_depth=max_depth))
 
     def color(self, min: float | None = None, max: float | None = None) -> NDArray[np.uint8]:
         """Return the map as a picture, (H, W, 3) uint8 RGB; see `colorize`.
@@ -115,13 +200,14 @@ class Disparity:
     def save(self, path: str | os.PathLike[str], *, clip: bool = False) -> None:
         """Write `disparity` as ``.png`` (KITTI), ``.pfm``, ``.npy`` or ``.tiff``.
 
-        See `stereokit.io.write_disparity`. Filled values are written like measured ones.
+        See `stereokit.io.write_disparity`. Filled values are written like measured ones; ``write_disparity(path,
+        result.measured)`` leaves them out.
 
         Parameters
         ----------
         path : path
         clip : bool
-            Bring what a ``.png`` cannot say, below 0 and above 65535/256 pixels, to its ends.
+            Clip disparities to the range of a ``.png``, 0 to 65535/256 pixels.
 
         Raises
         ------
@@ -134,7 +220,7 @@ class Disparity:
 
 
 def color_range(disparity: NDArray[Any]) -> tuple[float, float]:
-    """Return the disparities of the first and the last colour where nobody says otherwise, pixels.
+    """Return the default disparities of the first and the last colour, pixels.
 
     Parameters
     ----------
@@ -164,7 +250,7 @@ def colorize(disparity: ArrayLike, low: float | None = None, high: float | None 
     disparity : (H, W) float
         Pixels, not finite where invalid.
     low, high : float, optional
-        Disparities of the first and the last colour, pixels; what lies outside takes the end's colour. The defaults
+        Disparities of the first and the last colour, pixels; values outside take the end's colour. The defaults
         are those of `color_range`.
 
     Returns
@@ -191,13 +277,13 @@ def colorize(disparity: ArrayLike, low: float | None = None, high: float | None 
     if not (np.isfinite(low) and np.isfinite(high) and high > low):
         raise OptionError(f"high must be finite and above low, got low={low}, high={high}")
     span = (np.where(known, values, low).astype(np.float32) - np.float32(low)) / np.float32(high - low)
-    colors: NDArray[np.uint8] = _turbo()[np.rint(np.clip(span, 0, 1) * 255).astype(np.uint8)]
+    colors: NDArray[np.uint8] = _turbo_map()[np.rint(np.clip(span, 0, 1) * 255).astype(np.uint8)]
     colors[~known] = 0
     return colors
 
 
 @lru_cache(maxsize=1)
-def _turbo() -> NDArray[np.uint8]:
+def _turbo_map() -> NDArray[np.uint8]:
     steps = np.arange(256, dtype=np.uint8)[:, None]
     return np.ascontiguousarray(cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, 0, ::-1], dtype=np.uint8)
 

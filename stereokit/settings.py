@@ -14,8 +14,9 @@ from stereokit.costs.rows import Cost, Levels
 from stereokit.defaults import defaults_of
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean, shown
 from stereokit.images.check import check_flag, check_integer, check_names, check_nodata, check_number
-from stereokit.methods import check_levels, find_refiner, option_names, parse_method
-from stereokit.postprocess.chain import Chain
+from stereokit.methods import check_levels, current_names, find_refiner, option_names, parse_method
+from stereokit.options import opencv_hint
+from stereokit.postprocess.chain import PostProcessing
 from stereokit.postprocess.fill import FILLS
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
@@ -23,11 +24,11 @@ from stereokit.result import Disparity
 __all__ = ["Detail", "MatchSettings"]
 
 _PIPELINE = (
+    "border_cost",
     "confidence",
     "fill",
     "median",
     "nodata",
-    "outside",
     "right",
     "smooth",
     "smp",
@@ -38,7 +39,7 @@ _PIPELINE = (
 
 
 class Detail(IntEnum):
-    """What the selection tells of a pixel; each level brings what those below it bring."""
+    """The outputs of the selection for a pixel; each level includes those below it."""
 
     DISPARITY = 0
     CONFIDENCE = 1
@@ -47,7 +48,7 @@ class Detail(IntEnum):
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """All that a disparity map depends on, beside the images.
+    """Everything a disparity map depends on, except the images.
 
     Attributes
     ----------
@@ -56,18 +57,18 @@ class MatchSettings:
     levels : Levels
         Disparities that are tried, full-size pixels.
     scale : float
-        1, 0.5 or 0.25: the size at which is matched.
+        1, 0.5 or 0.25: the size of the matching.
     cost : Cost
     aggregation : Aggregation
     refiner : callable or None
-        What brings the map to full size, or makes it better there.
+        The function that brings the map to full size, or improves it there.
     refiner_name : str or None
         Its name, or the path of its weights.
     smooth : float
         Sigma of a Gaussian on both images, pixels; 0 for none.
     nodata : float or None
-        Value of pixels that hold nothing.
-    outside : float or None
+        Value of pixels without evidence.
+    border_cost : float or None
         Cost of matches outside the right image, as a share of the cost's range; None takes the border's pixel.
     subpixel : bool
         Interpolate between levels.
@@ -82,9 +83,9 @@ class MatchSettings:
     median : {0, 3, 5}
         Side of the window.
     confidence : bool
-        The result brings the confidence.
+        The result includes the confidence.
     right : bool
-        The result brings the right view's map.
+        The result includes the right view's map.
 
     Raises
     ------
@@ -101,7 +102,7 @@ class MatchSettings:
     refiner_name: str | None
     smooth: float
     nodata: float | None
-    outside: float | None
+    border_cost: float | None
     subpixel: bool
     uniqueness: float
     smp: bool
@@ -123,8 +124,8 @@ class MatchSettings:
         if self.median not in (0, 3, 5):
             raise OptionError(f"median must be 0, 3 or 5, got {self.median}")
         put("nodata", check_nodata(self.nodata))
-        if self.outside is not None:
-            put("outside", check_number("outside", self.outside, 0, 1))
+        if self.border_cost is not None:
+            put("border_cost", check_number("border_cost", self.border_cost, 0, 1))
         for name, high in (("smooth", 10), ("uniqueness", 100), ("speckle", 1)):
             put(name, check_number(name, getattr(self, name), 0, high))
         for name in ("smp", "subpixel", "confidence", "right"):
@@ -141,7 +142,7 @@ class MatchSettings:
         OptionError
             If an option does not exist or breaks its rule.
         """
-        method = parse_method(method)
+        method, options = parse_method(method), current_names(options)
         levels = check_levels(min_disparity, max_disparity)
         if (
             isinstance(scale, bool)
@@ -160,22 +161,24 @@ class MatchSettings:
                 raise OptionError(f"refiner {refiner_name!r} needs scale=0.5, got scale={scale:g}")
         cost_name, aggregation_name = method.split("+")
         make_cost, make_aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
-        of_cost, of_aggregation = option_names(make_cost), option_names(make_aggregation)
-        check_names("option", options, sorted({*_PIPELINE, *of_cost, *of_aggregation, *refiner_options}))
-        merged = {**defaults_of(method, half=scale != 1), **options}
-        cost = make_cost(**{k: merged[k] for k in of_cost if k in merged})
-        chosen = {k: merged[k] for k in of_aggregation if k in merged}
-        aggregation = make_aggregation(**_fitting(make_aggregation, cost, chosen, options))
+        cost_names, aggregation_names = option_names(make_cost), option_names(make_aggregation)
+        if (hint := opencv_hint(options)) is not None:
+            raise OptionError(hint)
+        check_names("option", options, sorted({*_PIPELINE, *cost_names, *aggregation_names, *refiner_options}))
+        values = {**defaults_of(method, half=scale != 1), **options}
+        cost = make_cost(**{k: values[k] for k in cost_names if k in values})
+        aggregation_options = {k: values[k] for k in aggregation_names if k in values}
+        aggregation = make_aggregation(**_fitting(make_aggregation, cost, aggregation_options, options))
         if hasattr(aggregation, "check_cost"):
             aggregation.check_cost(cost)
         return cls(
             method=method, levels=levels, scale=float(scale), cost=cost, aggregation=aggregation, refiner=refine,
-            refiner_name=refiner_name, **{name: merged[name] for name in _PIPELINE},
+            refiner_name=refiner_name, **{name: values[name] for name in _PIPELINE},
         )  # fmt: skip
 
     @property
     def matched_levels(self) -> Levels:
-        """The levels of the size at which is matched."""
+        """The levels at the size of the matching."""
         step = self.step
         low = self.levels.minimum // step
         high = max(-(-(self.levels.minimum + self.levels.count) // step), low + 1)
@@ -183,8 +186,18 @@ class MatchSettings:
 
     @property
     def step(self) -> int:
-        """Full-size pixels along a pixel of the size at which is matched."""
+        """Full-size pixels along a pixel of the matched size."""
         return round(1 / self.scale)
+
+    @property
+    def reach(self) -> tuple[int, int] | None:
+        """How far a match looks around a pixel, across and down, full-size pixels; None where the cost does not say."""
+        window = getattr(self.cost, "reach", None)
+        if window is None:
+            return None
+        kernel = (round(8 * self.smooth + 1) | 1) // 2 if self.smooth > 0 else 0  # of OpenCV, in 16 bits
+        across, down = (self.step * (side + kernel) + self.step - 1 for side in window)
+        return across, down
 
     @property
     def floor(self) -> int | None:
@@ -194,46 +207,46 @@ class MatchSettings:
 
     @property
     def detail(self) -> Detail:
-        """What the selection must tell, for the result and for the refiner."""
+        """The outputs of the selection that the result and the refiner need."""
         if getattr(self.refiner, "needs_candidates", False):
             return Detail.CANDIDATES
         needed = self.confidence or bool(getattr(self.refiner, "needs_confidence", False))
         return Detail.CONFIDENCE if needed else Detail.DISPARITY
 
-    def post_processing(self, pixels: int) -> Chain:
-        """Return what is done to a selected map of so many pixels."""
-        return Chain(self.smp, int(self.speckle * pixels), self.fill, self.median, self.matched_levels.minimum)
+    def post_processing(self, pixels: int) -> PostProcessing:
+        """Return the post-processing of a selected map of so many pixels."""
+        return PostProcessing(self.smp, int(self.speckle * pixels), self.fill, self.median, self.matched_levels.minimum)
 
     def replaced(self, **changes: Any) -> MatchSettings:
         """Return settings that differ in some values."""
-        return replace(self, **changes)
+        return replace(self, **current_names(changes))
 
     def identity(self) -> dict[str, Any]:
-        """Return what a map depends on as plain values, fit for JSON; refiners as the fingerprint of their weights."""
-        plain: dict[str, Any] = {}
+        """Return all settings as plain values, fit for JSON; refiners as the fingerprint of their weights."""
+        content: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "levels":
-                plain["min_disparity"], plain["max_disparity"] = value.minimum, value.minimum + value.count
+                content["min_disparity"], content["max_disparity"] = value.minimum, value.minimum + value.count
             elif field.name == "refiner":
-                plain["weights"] = _fingerprint(value)
+                content["weights"] = _fingerprint(value)
             elif field.name == "refiner_name":
-                plain["refiner"] = value
+                content["refiner"] = value
             else:
-                plain[field.name] = value if isinstance(value, (int, float, str, type(None))) else repr(value)
-        return plain
+                content[field.name] = value if isinstance(value, (int, float, str, type(None))) else repr(value)
+        return content
 
 
-def _fitting(factory: Any, cost: Cost, chosen: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return an aggregation's options; defaults give way to what the cost leaves of 8 bits."""
+def _fitting(factory: Any, cost: Cost, values: dict[str, Any], user_options: dict[str, Any]) -> dict[str, Any]:
+    """Return an aggregation's options; defaults are reduced to fit into 8 bits beside the cost's range."""
     fit = getattr(factory, "fitting", None)
     if fit is None:
-        return chosen
-    defaults = {name: value for name, value in chosen.items() if name not in given}
-    return {**chosen, **fit(cost, defaults)}
+        return values
+    defaults = {name: value for name, value in values.items() if name not in user_options}
+    return {**values, **fit(cost, defaults)}
 
 
 def _fingerprint(refiner: Any) -> str | None:
-    found = getattr(refiner, "fingerprint", None)
-    found = found() if callable(found) else found
-    return found if isinstance(found, str) else None
+    fingerprint = getattr(refiner, "fingerprint", None)
+    fingerprint = fingerprint() if callable(fingerprint) else fingerprint
+    return fingerprint if isinstance(fingerprint, str) else None

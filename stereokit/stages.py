@@ -1,9 +1,9 @@
-"""The stages on whole volumes, for those who reuse the parts.
+"""The stages on whole volumes, for use on their own.
 
-With the same options, ``select(aggregate(cost_volume(left, right), guide))`` gives what `stereokit.Matcher` gives
-before post-processing, bit for bit: the same compiled code runs over rows of a stored volume instead of rows made on
-the way. The stages do not know of methods, so they have their own plain defaults; those of a method are in
-`stereokit.defaults` (window, penalties, ``smooth`` and ``outside``).
+With the same options, ``select(aggregate(cost_volume(left, right), guide))`` equals the map of `stereokit.Matcher`
+before post-processing, bit for bit: the same compiled code runs over rows of a stored volume instead of rows computed
+on the way. The stages do not depend on methods, so they have their own plain defaults; those of a method are in
+`stereokit.defaults` (window, penalties, ``smooth`` and ``border_cost``).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Cost, Levels, Pair, VolumeRows, produce_volume, takes_8_bits
+from stereokit.costs.rows import Cost, CostInput, Levels, VolumeRows, produce_volume, takes_8_bits
 from stereokit.errors import InputError, OptionError
 from stereokit.images.check import check_integer, check_nodata, check_number, writable
 from stereokit.images.gray import gray_pair
@@ -21,15 +21,15 @@ from stereokit.images.maps import numbers
 from stereokit.images.resize import smooth as smoothed
 from stereokit.kernels.threads import available_threads
 from stereokit.kernels.workspace import Workspace
-from stereokit.methods import build_aggregation, build_cost, check_levels
-from stereokit.selection.wta import winners_like
+from stereokit.methods import build_aggregation, build_cost, check_levels, current_names
+from stereokit.selection.wta import selection_output
 
 __all__ = ["aggregate", "cost_volume"]
 
 
 def cost_volume(
     left: Any, right: Any, cost: str | Cost = "zncc", *, max_disparity: int = 128, min_disparity: int = 0,
-    outside: float | None = 1.0, smooth: float = 0.0, nodata: float | None = None, threads: int | None = None,
+    border_cost: float | None = 1.0, smooth: float = 0.0, nodata: float | None = None, threads: int | None = None,
     **options: Any,
 ) -> NDArray[np.uint8]:  # fmt: skip
     """Return the matching costs of all pixels and levels.
@@ -42,7 +42,7 @@ def cost_volume(
         Name of the cost, or the cost itself.
     max_disparity, min_disparity : int
         Levels ``min_disparity <= d < max_disparity``, pixels.
-    outside : float or None
+    border_cost : float or None
         Cost of matches outside the right image as a share of the cost's range; None takes the border pixel.
     smooth : float
         Sigma in pixels of a Gaussian on both images before matching.
@@ -51,7 +51,7 @@ def cost_volume(
     threads : int or None
         Threads; None uses the processors at hand.
     **options
-        Those of the cost.
+        Those of the cost; ``outside`` is the old name of `border_cost`.
 
     Returns
     -------
@@ -63,13 +63,15 @@ def cost_volume(
     InputError, OptionError
         If an image or an option cannot be used.
     """
+    options = current_names(options)
+    border_cost = options.pop("border_cost", border_cost)
     stage: Cost = build_cost(cost, options)
     levels = check_levels(min_disparity, max_disparity)
     count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
-    share = None if outside is None else check_number("outside", outside, 0, 1)
+    share = None if border_cost is None else check_number("border_cost", border_cost, 0, 1)
     sigma = check_number("smooth", smooth, 0, 10)
     gray = smoothed(gray_pair(left, right, check_nodata(nodata)), sigma, eight_bits=takes_8_bits(stage))
-    pair = Pair(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
+    pair = CostInput(gray.left, gray.right, gray.left_bad, gray.right_bad, levels, share, count)
     return produce_volume(stage.prepare(pair, Workspace(), count), gray.left.shape, levels, count)
 
 
@@ -88,7 +90,7 @@ def aggregate(
     aggregation : str
         Name of the aggregation.
     cost : str or Cost
-        The cost that made the volume: its range and unit scale the penalties of ``"sgm"``.
+        The cost of the volume: its range and unit scale the penalties of ``"sgm"``.
     threads : int or None
         Threads; None uses the processors at hand.
     **options
@@ -106,7 +108,7 @@ def aggregate(
         If the volume, the guide or an option cannot be used.
     """
     stage = build_aggregation(aggregation, options)
-    maker: Cost = build_cost(cost, {})
+    cost_stage: Cost = build_cost(cost, {})
     volume = numbers("volume", volume)
     floats = volume.dtype == np.float32
     if volume.ndim != 3 or 0 in volume.shape or not (volume.dtype == np.uint8 or floats):
@@ -119,19 +121,21 @@ def aggregate(
     if guide.dtype != np.uint8 or guide.shape != volume.shape[:2]:
         raise InputError(f"guide must be uint8 {volume.shape[:2]}, got {guide.dtype} {guide.shape}")
     count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
-    if not floats and int(volume.max()) > maker.cost_max:
-        raise OptionError(f"cost {maker.name!r} has costs up to {maker.cost_max}, but the volume has {volume.max()}")
+    if not floats and int(volume.max()) > cost_stage.cost_max:
+        raise OptionError(
+            f"cost {cost_stage.name!r} has costs up to {cost_stage.cost_max}, but the volume has {volume.max()}"
+        )
     height, width, depth = volume.shape
     levels = Levels(0, depth)
     total_dtype = np.dtype(np.float32) if floats else np.dtype(stage.total_dtype)
     total = np.empty((height, width, levels.padded), total_dtype)
-    unused = np.empty((height, width), np.float32), np.empty((height, width), total_dtype)
-    out = winners_like(*unused, None, depth, 0, False)
+    maps = np.empty((height, width), np.float32), np.empty((height, width), total_dtype)
+    out = selection_output(*maps, None, depth, 0, False)
     rows = [VolumeRows(writable(volume), levels.padded)] * max(2, count)
-    extra: dict[str, Any] = {}
+    keywords: dict[str, Any] = {}
     if floats:
         padded = np.zeros((height, width, levels.padded), np.float32)
         padded[:, :, :depth] = volume
-        extra["volume"] = padded
-    stage.sweep(rows, levels, maker, guide, Workspace(), count, out, total, **extra)
+        keywords["volume"] = padded
+    stage.sweep(rows, levels, cost_stage, guide, Workspace(), count, out, total, **keywords)
     return np.ascontiguousarray(total[:, :, :depth])

@@ -31,10 +31,10 @@ def sources():
 def test_private_parts_of_numba_are_used_where_it_is_said():
     used: dict[str, set[str]] = {}
     for name, text in sources():
-        found = set(re.findall(r"""["']?(_nrt|forceinline)["']?\s*[=:]""", text))
-        found |= set(re.findall(r"^from (numba\.cuda|numba\.core\.caching) import", text, flags=re.M))
-        if found:
-            used[name] = found
+        parts = set(re.findall(r"""["']?(_nrt|forceinline)["']?\s*[=:]""", text))
+        parts |= set(re.findall(r"^from (numba\.cuda|numba\.core\.caching) import", text, flags=re.M))
+        if parts:
+            used[name] = parts
     assert used == PRIVATE
 
 
@@ -77,6 +77,16 @@ def test_what_is_built_holds_none_either(kind):
     names = [file.distribution_path for file in builder.recurse_included_files()]
     assert [name.rpartition("/")[2] for name in names if name.endswith(".safetensors")] == ["evidence.safetensors"]
     assert not any("kitti_weights" in name for name in names)
+
+
+@pytest.mark.parametrize(("old", "new"), [("evaluation", "scenes"), ("fast", "refiners"), ("large", "tiff")])
+def test_extras_have_their_old_names_too(old, new):
+    required = {name: set() for name in metadata("stereokit").get_all("Provides-Extra")}
+    for requirement in map(Requirement, requires("stereokit")):
+        for extra in (old, new):
+            if requirement.marker is not None and requirement.marker.evaluate({"extra": extra}):
+                required[extra].add(requirement.name)
+    assert required[old] == required[new] != set()
 
 
 @pytest.mark.parametrize("name", ["stereokit", "stereokit_refiners", "stereokit_evaluation"])

@@ -55,7 +55,7 @@ PRECISIONS = ("fp32", "bf16", "int8")
 _MOST_COMPILED = 4  # networks
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
 
-Run = Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]
+Run = Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]
 """From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
 
 
@@ -355,11 +355,11 @@ def _backend(name: str) -> str:
         if not installed:
             raise StereokitError(
                 "learned refiners need OpenCV's dnn, which this build lacks, or another runtime: pip install "
-                "'stereokit[fast]', or 'stereokit[onnx]' where OpenVINO has no wheel"
+                "'stereokit[refiners]', or 'stereokit[onnx]' where OpenVINO has no wheel"
             )
         return installed[0]
     if name not in installed:
-        way = {"openvino": "'stereokit[fast]'", "onnxruntime": "'stereokit[onnx]'", "torch": "'stereokit[train]'"}
+        way = {"openvino": "'stereokit[refiners]'", "onnxruntime": "'stereokit[onnx]'", "torch": "'stereokit[train]'"}
         raise StereokitError(
             f"backend {name!r} is not installed: pip install {way.get(name, 'opencv-python-headless')}"
         )
@@ -448,7 +448,7 @@ class _Compiled:
         self._lock = threading.Lock()
         self.warned = False
 
-    def run(self, inputs: dict[str, NDArray[np.float32]], threads: int) -> NDArray[np.float32]:
+    def run(self, inputs: dict[str, NDArray[Any]], threads: int) -> NDArray[np.float32]:
         """Return the head for encoded inputs."""
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)

@@ -1,4 +1,4 @@
-"""What both forms of the CUDA domain transform share: feedback pixel by pixel, marks and bands."""
+"""Common parts of both forms of the CUDA domain transform: feedback pixel by pixel, marks and bands."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def _make_edges(name: str, weight: Any) -> Kernel:
             row[at] = left
             column[at] = above
 
-    made: Kernel = edges
-    return made
+    result: Kernel = edges
+    return result
 
 
 _edges_rf = _make_edges("dt_edges_rf", i16)
@@ -49,8 +49,8 @@ def weights(
     floats = dt.mode == "sum"
     edges, dtype = (_edges_sum, np.float32) if floats else (_edges_rf, np.int16)
     tables = dt.weights(dtype, cost_max)[number]
-    row = queue.once(f"dt.{dt.mode}.row{number}", (dt, cost_max), lambda: tables.row)
-    column = queue.once(f"dt.{dt.mode}.column{number}", (dt, cost_max), lambda: tables.column)
+    row = queue.cached(f"dt.{dt.mode}.row{number}", (dt, cost_max), lambda: tables.row)
+    column = queue.cached(f"dt.{dt.mode}.column{number}", (dt, cost_max), lambda: tables.column)
     rows = queue.array(f"dt.{dt.mode}.rows", height * width, dtype)
     columns = queue.array(f"dt.{dt.mode}.columns", height * width, dtype)
     blocks = blocks_for(height * width, edges.block)
@@ -66,5 +66,5 @@ def bands(width: int, column_bytes: int) -> list[tuple[int, int]]:
 
 
 def marks_of(pixels: int) -> int:
-    """Return how many marks a line of so many pixels has: none before its first segment."""
+    """Return the number of marks of a line of so many pixels: none before its first segment."""
     return -(-pixels // SEGMENT) - 1

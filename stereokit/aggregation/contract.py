@@ -1,7 +1,7 @@
 """The contract of an aggregation, for those who bring their own (entry-point group ``stereokit.aggregations``).
 
-An aggregation is a frozen dataclass whose fields are its options. It sweeps over the rows of a cost, adds up what it
-finds on the way and selects as it goes, so that no volume need be stored (`stereokit.aggregation.sgm.Sgm` and
+An aggregation is a frozen dataclass whose fields are its options. It sweeps over the rows of a cost, sums the costs and
+selects as it goes, so that no volume need be stored (`stereokit.aggregation.sgm.Sgm` and
 `stereokit.aggregation.dt.Dt` are two). It may further have
 
 - ``fitting(cost, defaults)``, a class method: changes to default options that a cost calls for;
@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, Levels
 from stereokit.kernels.workspace import Workspace
-from stereokit.selection.wta import Winners
+from stereokit.selection.wta import SelectionOutput
 
 __all__ = ["Aggregation"]
 
 
 class Aggregation(Protocol):
-    """What an aggregation offers."""
+    """Sweeps over the rows of a cost, sums and selects."""
 
     name: ClassVar[str]
 
@@ -39,7 +39,7 @@ class Aggregation(Protocol):
 
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
-        threads: int, out: Winners, total: NDArray[Any] | None = None,
+        threads: int, out: SelectionOutput, total: NDArray[Any] | None = None,
     ) -> None:  # fmt: skip
         """Aggregate the rows of a cost and select.
 
@@ -57,8 +57,8 @@ class Aggregation(Protocol):
             Buffers.
         threads : int
             Threads to use; the result must not depend on it.
-        out : Winners
-            Where `stereokit.selection.wta.select_row` writes.
+        out : SelectionOutput
+            Maps that `stereokit.selection.wta.select_row` writes.
         total : (H, W, P) of `total_dtype`, optional
-            Where the aggregated costs go, if they are wanted.
+            Volume for the aggregated costs, if they are wanted.
         """

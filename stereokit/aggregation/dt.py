@@ -55,17 +55,17 @@ from stereokit.kernels.threads import run, spans
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
-from stereokit.selection.wta import Winners, keys_of, select_pixel
+from stereokit.selection.wta import SelectionOutput, keys_of, select_pixel
 
 __all__ = ["Dt", "edge_weights"]
 
 
 class Weights(NamedTuple):
-    """Feedback by grey difference of the step, of one pass: (256,) float32, or int16 times 2**15."""
+    """Feedback of one pass by grey difference of the step: (256,) float32, or int16 times 2**15."""
 
     row: NDArray[Any]
     column: NDArray[Any]
-    keep: NDArray[Any]  # (1,): 1 for the normalised recursion, 0 for the plain sum
+    normalised: NDArray[Any]  # (1,): 1 for the normalised recursion, 0 for the plain sum
     shift: int  # fixed point: the volume's bytes hold `_FRACTION_BITS - shift` fractional bits
 
 
@@ -91,7 +91,7 @@ class Dt:
     passes : int
         Passes N over the image (``rf``), 1 to 5.
     mode : {"rf", "sum"}
-        Which of the two published forms.
+        One of the two published forms.
     """
 
     sigma_s: float = 20.0
@@ -144,7 +144,7 @@ class Dt:
 
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
-        threads: int, out: Winners, total: NDArray[Any] | None = None, volume: NDArray[Any] | None = None,
+        threads: int, out: SelectionOutput, total: NDArray[Any] | None = None, volume: NDArray[Any] | None = None,
     ) -> None:  # fmt: skip
         """Aggregate the rows of a producer and select; parameters as of `stereokit.aggregation.sgm.Sgm.sweep`.
 
@@ -155,11 +155,11 @@ class Dt:
         blocks = tuple(range(padded // LANES))
         dtype = self.total_dtype if volume is None else np.dtype(np.float32)
         if volume is None:
-            stored = np.uint8 if self.mode == "rf" else np.float32
-            costs = workspace.array("dt.volume", height * width * padded, stored)
+            volume_dtype = np.uint8 if self.mode == "rf" else np.float32
+            costs = workspace.array("dt.volume", height * width * padded, volume_dtype)
         else:
             costs = volume.reshape(-1)
-        keep = np.empty(0, dtype) if total is None else total.reshape(-1)
+        total_out = np.empty(0, dtype) if total is None else total.reshape(-1)
         passes = self.weights(dtype, cost.cost_max)
         # A band is narrow enough for its columns to stay in the caches between the way down and the way up.
         band = max(1, min(width, 2**20 // max(1, height * padded * np.dtype(dtype).itemsize)))
@@ -183,7 +183,9 @@ class Dt:
             state = workspace.array(f"dt.state{k}", band * padded, dtype)
             for x0, x1 in shares[k]:
                 with span("match", "sweep: columns"):
-                    _filter_band(blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, keep)
+                    _filter_band(
+                        blocks, guide, weights, x0, x1, costs, column, state, keys_of(state), last, out, total_out
+                    )
 
         for number, weights in enumerate(passes):
             last = number == len(passes) - 1
@@ -200,31 +202,33 @@ def edge_weights() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 @by_types
-def _feed_back(value: Any, before: Any, weight: Any, keep: Any) -> Any:
-    """Return ``value + weight * (before - keep * value)`` of int16 or float32 vectors; compiled code only.
+def _feed_back(value: Any, before: Any, weight: Any, normalised: Any) -> Any:
+    """Return ``value + weight * (before - normalised * value)`` of int16 or float32 vectors; compiled code only.
 
     Fixed point rounds down.
     """
     if value.scalar == types.int16:
-        return lambda value, before, weight, keep: add(
+        return lambda value, before, weight, normalised: add(
             value, multiply_high(shift_left(subtract(before, value), 1), weight)
         )
-    return lambda value, before, weight, keep: add(value, multiply(weight, subtract(before, multiply(keep, value))))
+    return lambda value, before, weight, normalised: add(
+        value, multiply(weight, subtract(before, multiply(normalised, value)))
+    )
 
 
 @by_types
-def _feed_back_up(value: Any, before: Any, weight: Any, keep: Any) -> Any:
-    """Return what `_feed_back` does, but fixed point rounds up: the way back makes up for the way there."""
+def _feed_back_up(value: Any, before: Any, weight: Any, normalised: Any) -> Any:
+    """Return the value of `_feed_back`, but fixed point rounds up: the way back makes up for the way there."""
     if value.scalar == types.int16:
-        return lambda value, before, weight, keep: subtract(
+        return lambda value, before, weight, normalised: subtract(
             value, multiply_high(shift_left(subtract(value, before), 1), weight)
         )
-    return lambda value, before, weight, keep: _feed_back(value, before, weight, keep)
+    return lambda value, before, weight, normalised: _feed_back(value, before, weight, normalised)
 
 
 @by_types
 def _unpack(costs: Any, at: Any, shift: Any, like: Any) -> Any:
-    """64 costs of the volume in the type of `like`; compiled code only."""
+    """Return 64 costs of the volume in the type of `like`; compiled code only."""
     if costs.dtype == types.uint8:
         return lambda costs, at, shift, like: shift_left(convert(load(costs, at), like), shift)
     return lambda costs, at, shift, like: load(costs, at)
@@ -232,9 +236,9 @@ def _unpack(costs: Any, at: Any, shift: Any, like: Any) -> Any:
 
 @by_types
 def _pack(costs: Any, at: Any, value: Any, shift: Any) -> Any:
-    """Put 64 costs into the volume, rounded to what it holds; compiled code only."""
+    """Put 64 costs into the volume, rounded to its fractional bits; compiled code only."""
     if costs.dtype == types.uint8:
-        # Half a step is added before the shift; the largest cost, 255, must not pass the byte.
+        # Half a step is added before the shift; the largest cost, 255, must not leave the byte.
         return lambda costs, at, value, shift: store(
             costs,
             at,
@@ -259,20 +263,20 @@ def _filter_row(
     """Forward, then backward along one row of levels at ``row[base:]``, in place."""
     width = guide.shape[1]
     padded = LANES * len(blocks)
-    keep = splat(weights.keep[0])
+    normalised = splat(weights.normalised[0])
     for x in range(1, width):
         weight = splat(weights.row[_jump(guide, y, x, y, x - 1)])
         at = base + x * padded
         for n in range(len(blocks)):
             to = at + n * LANES
-            store(row, to, _feed_back(load(row, to), load(row, to - padded), weight, keep))
+            store(row, to, _feed_back(load(row, to), load(row, to - padded), weight, normalised))
     for back in range(1, width):
         x = width - 1 - back
         weight = splat(weights.row[_jump(guide, y, x + 1, y, x)])
         at = base + x * padded
         for n in range(len(blocks)):
             to = at + n * LANES
-            store(row, to, _feed_back_up(load(row, to), load(row, to + padded), weight, keep))
+            store(row, to, _feed_back_up(load(row, to), load(row, to + padded), weight, normalised))
 
 
 @kernel
@@ -311,14 +315,14 @@ def _filter_rows(
 @kernel
 def _filter_band(
     blocks: tuple[int, ...], guide: NDArray[np.uint8], weights: Weights, x0: int, x1: int, costs: NDArray[Any],
-    column: NDArray[Any], state: NDArray[Any], keys: NDArray[Any], last: bool, out: Winners,
+    column: NDArray[Any], state: NDArray[Any], keys: NDArray[Any], last: bool, out: SelectionOutput,
     total: NDArray[Any],
 ) -> None:  # fmt: skip
     """Down, then up the columns x0..x1; select on the way up of the last pass, else write the costs back."""
     height, width = guide.shape
     padded = LANES * len(blocks)
     size = (x1 - x0) * padded
-    keep = splat(weights.keep[0])
+    normalised = splat(weights.normalised[0])
     none = state.dtype.type(0)
     state[:] = none
     for y in range(height):
@@ -328,7 +332,7 @@ def _filter_band(
             for n in range(len(blocks)):
                 at = (x - x0) * padded + n * LANES
                 value = _unpack(costs, base + at, weights.shift, none)
-                value = _feed_back(value, load(state, at), weight, keep)
+                value = _feed_back(value, load(state, at), weight, normalised)
                 store(state, at, value)
                 store(column, y * size + at, value)
     for back in range(height):
@@ -338,7 +342,7 @@ def _filter_band(
             weight = splat(weights.column[_jump(guide, y + 1, x, y, x)] if back > 0 else none)
             for n in range(len(blocks)):
                 at = (x - x0) * padded + n * LANES
-                store(state, at, _feed_back_up(load(column, y * size + at), load(state, at), weight, keep))
+                store(state, at, _feed_back_up(load(column, y * size + at), load(state, at), weight, normalised))
             if last:
                 select_pixel(keys, state, (x - x0) * padded, blocks, y * width + x, out)
         if not last:

@@ -44,7 +44,7 @@ from stereokit.selection.wta_cuda import RULES, Maps, select, selector
 __all__ = ["aggregate"]
 
 _FRACTION_BITS = 6
-_HELD = 2 * SEGMENT  # words of a thread: each has two costs of 16 bits
+_SEGMENT_WORDS = 2 * SEGMENT  # words of a thread: each has two costs of 16 bits
 
 
 @device
@@ -108,7 +108,7 @@ def _leave_marks(volume, weights, marks, thread, threads, start, step, count, qu
 
 
 @device
-def _walk_again(volume, weights, marks, held, thread, threads, start, step, count, quad, quads, fraction, segment):  # type: ignore[no-untyped-def]
+def _walk_again(volume, weights, marks, steps, thread, threads, start, step, count, quad, quads, fraction, segment):  # type: ignore[no-untyped-def]
     """Walk one segment there, from its mark, and hold what it computes; pixels past the line's end repeat the last."""
     state = i32(0), i32(0), i32(0), i32(0)
     if segment > u32(0):
@@ -118,13 +118,13 @@ def _walk_again(volume, weights, marks, held, thread, threads, start, step, coun
     for k in range(SEGMENT):
         pixel = u32(start + u32(min(u32(segment + u32(k)), last) * step))
         state = _step(state, volume[u32(u32(pixel * quads) + quad)], i32(weights[pixel]), fraction)
-        held[2 * k] = _pair(state[0], state[1])
-        held[2 * k + 1] = _pair(state[2], state[3])
+        steps[2 * k] = _pair(state[0], state[1])
+        steps[2 * k + 1] = _pair(state[2], state[3])
 
 
 @device
-def _step_back(state, held, k, weight):  # type: ignore[no-untyped-def]
-    a, b, c, d = _apart(held[2 * k], held[2 * k + 1])
+def _step_back(state, steps, k, weight):  # type: ignore[no-untyped-def]
+    a, b, c, d = _apart(steps[2 * k], steps[2 * k + 1])
     return (
         _back(a, state[0], weight),
         _back(b, state[1], weight),
@@ -152,17 +152,17 @@ def _walker(finish: Any) -> Any:
     @device
     def walk(volume, weights, marks, thread, threads, start, step, count, quad, quads, fraction, target):  # type: ignore[no-untyped-def]
         segment = _leave_marks(volume, weights, marks, thread, threads, start, step, count, quad, quads, fraction)
-        held = cuda.local.array(_HELD, u32)
+        steps = cuda.local.array(_SEGMENT_WORDS, u32)
         state = i32(0), i32(0), i32(0), i32(0)
         more = True
         while more:
             _walk_again(
-                volume, weights, marks, held, thread, threads, start, step, count, quad, quads, fraction, segment
+                volume, weights, marks, steps, thread, threads, start, step, count, quad, quads, fraction, segment
             )
             for j in range(SEGMENT):
                 k = SEGMENT - 1 - j
                 n = u32(segment + u32(k))
-                state = _step_back(state, held, k, _weight_back(weights, start, step, n, count))
+                state = _step_back(state, steps, k, _weight_back(weights, start, step, n, count))
                 finish(state, n, target)
             more = segment > u32(0)
             segment = u32(segment - u32(SEGMENT))
@@ -171,7 +171,7 @@ def _walker(finish: Any) -> Any:
 
 
 @device
-def _keep_bytes(state, n, target):  # type: ignore[no-untyped-def]
+def _write_bytes(state, n, target):  # type: ignore[no-untyped-def]
     volume, start, step, count, quad, quads, shift = target
     if n < count:
         low = u32(_pack(state[0], shift, 0) | _pack(state[1], shift, 1))
@@ -180,15 +180,15 @@ def _keep_bytes(state, n, target):  # type: ignore[no-untyped-def]
 
 
 @device
-def _keep_totals(state, n, target):  # type: ignore[no-untyped-def]
+def _write_totals(state, n, target):  # type: ignore[no-untyped-def]
     totals, thread, threads, count = target
     if n < count:
         to = u32(u32(n * threads) + thread)
         store2(totals, u32(to * u32(2)), (_pair(state[0], state[1]), _pair(state[2], state[3])))
 
 
-_walk_bytes = _walker(_keep_bytes)
-_walk_totals = _walker(_keep_totals)
+_walk_bytes = _walker(_write_bytes)
+_walk_totals = _walker(_write_totals)
 
 
 @kernel(array(u32), array(i16), array(u32), *[u32] * 5, i32, i32)
@@ -225,21 +225,21 @@ def select_kernel(padded: int) -> Kernel:
     maps = array(f32), array(u16), array(f32), *RULES
 
     @device
-    def keep_winner(state, n, target):  # type: ignore[no-untyped-def]
+    def write_winner(state, n, target):  # type: ignore[no-untyped-def]
         values, lane, start, alive, height, width, disparity, cost, confidence, rules = target
-        levels, minimum, subpixel, uniqueness, confident = rules
+        levels, minimum, subpixel, uniqueness, detail = rules
         values[0], values[1], values[2], values[3] = state
         choose(
             values, lane, u32(start + u32(n * width)), alive and n < height, disparity, cost, confidence,
-            levels, minimum, subpixel, uniqueness, confident,
+            levels, minimum, subpixel, uniqueness, detail,
         )  # fmt: skip
 
-    walk = _walker(keep_winner)
+    walk = _walker(write_winner)
 
     @kernel(array(u32), array(i16), array(u32), u32, u32, i32, *maps, name=f"dt_walk_select_{padded}")
     def walk_select(  # type: ignore[no-untyped-def]
         volume, weights, marks, height, width, fraction, disparity, cost, confidence,
-        levels, minimum, subpixel, uniqueness, confident,
+        levels, minimum, subpixel, uniqueness, detail,
     ):  # fmt: skip
         """Lanes past the last column walk it too, so that warps stay whole, but leave their marks elsewhere."""
         thread = u32(cuda.grid(1))
@@ -248,13 +248,13 @@ def select_kernel(padded: int) -> Kernel:
         quad = u32(thread - u32(line * u32(quads)))
         start = min(line, u32(width - u32(1)))
         values = cuda.local.array(4, i32)
-        rules = levels, minimum, subpixel, uniqueness, confident
+        rules = levels, minimum, subpixel, uniqueness, detail
         lane = i32(thread & u32(31))
         target = values, lane, start, line < width, height, width, disparity, cost, confidence, rules
         walk(volume, weights, marks, thread, threads, start, width, height, quad, u32(quads), fraction, target)
 
-    made: Kernel = walk_select
-    return made
+    result: Kernel = walk_select
+    return result
 
 
 for _padded in (32, 64, 128):
@@ -269,11 +269,11 @@ def aggregate(
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     dt : Dt
         Options.
     cost : Cost
-        What made the volume.
+        Cost of the volume.
     costs : (H * W * padded / 4,) uint32
         The volume (`stereokit.costs.rows_cuda`); overwritten.
     guide : (H * W,) uint8
@@ -283,7 +283,7 @@ def aggregate(
     padded : int
         Levels of the volume.
     maps : Maps
-        Where selection goes.
+        Maps of the selection.
     """
     if dt.mode == "sum":
         aggregate_sum(queue, dt, cost.cost_max, costs, guide, shape, padded, maps)

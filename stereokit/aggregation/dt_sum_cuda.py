@@ -44,7 +44,7 @@ def _leave_marks(values, weights, marks, thread, threads, first, stride, start, 
 
 
 @device
-def _walk_again(values, weights, marks, held, thread, threads, first, stride, start, step, last, segment):  # type: ignore[no-untyped-def]
+def _walk_again(values, weights, marks, steps, thread, threads, first, stride, start, step, last, segment):  # type: ignore[no-untyped-def]
     """Walk one segment there, from its mark, and hold what it computes; past `last` that one is repeated."""
     a = f32(0)
     if segment > u32(0):
@@ -52,7 +52,7 @@ def _walk_again(values, weights, marks, held, thread, threads, first, stride, st
     for k in range(SEGMENT):
         n = min(u32(segment + u32(k)), last)
         a = _feed(f32(values[u32(first + u32(n * stride))]), a, weights[u32(start + u32(n * step))])
-        held[k] = a
+        steps[k] = a
 
 
 @device
@@ -92,16 +92,16 @@ def _sum_rows(costs, weights, marks, state, out, height, width, x0, band, levels
     b = f32(0)
     if end < width:
         b = state[thread]
-    held = cuda.local.array(SEGMENT, f32)
+    steps = cuda.local.array(SEGMENT, f32)
     segment = u32(x0 + u32(u32(u32(band - u32(1)) // u32(SEGMENT)) * u32(SEGMENT)))
     more = True
     while more:
-        _walk_again(costs, weights, marks, held, thread, threads, first, levels, start, u32(1), last, segment)
+        _walk_again(costs, weights, marks, steps, thread, threads, first, levels, start, u32(1), last, segment)
         for j in range(SEGMENT):
             k = SEGMENT - 1 - j
             x = u32(segment + u32(k))
             if x <= last:
-                b = _feed(held[k], b, _weight_back(weights, start, u32(1), x, width))
+                b = _feed(steps[k], b, _weight_back(weights, start, u32(1), x, width))
                 out[u32(u32(u32(u32(line * band) + u32(x - x0)) * levels) + level)] = b
         more = segment > x0
         segment = u32(segment - u32(SEGMENT))
@@ -118,16 +118,16 @@ def _sum_columns(totals, weights, marks, height, width, x0, band, levels):  # ty
     start = u32(x0 + u32(thread // levels))
     last = u32(height - u32(1))
     segment = _leave_marks(totals, weights, marks, thread, threads, thread, threads, start, width, height)
-    held = cuda.local.array(SEGMENT, f32)
+    steps = cuda.local.array(SEGMENT, f32)
     b = f32(0)
     more = True
     while more:
-        _walk_again(totals, weights, marks, held, thread, threads, thread, threads, start, width, last, segment)
+        _walk_again(totals, weights, marks, steps, thread, threads, thread, threads, start, width, last, segment)
         for j in range(SEGMENT):
             k = SEGMENT - 1 - j
             y = u32(segment + u32(k))
             if y <= last:
-                b = _feed(held[k], b, _weight_back(weights, start, width, y, height))
+                b = _feed(steps[k], b, _weight_back(weights, start, width, y, height))
                 totals[u32(u32(y * threads) + thread)] = b
         more = segment > u32(0)
         segment = u32(segment - u32(SEGMENT))

@@ -2,10 +2,10 @@
 
 Costs are aggregated along 4, 5 or 8 straight paths through the image and summed. Two sweeps carry the paths that
 come from above and from below, a row at a time: each computes the costs of a row when it gets there, so that no
-cost volume is stored (`stereokit.aggregation._paths` has the picture).
+cost volume is stored (`stereokit.aggregation.paths` has the picture).
 
 The down sweep visits the upper half first while the up sweep visits the lower half; each leaves the sum of its
-three paths. Then each goes on into the half where the other has been, adds what it finds there and the two paths
+three paths. Then each goes on into the half where the other has been, adds the other's sums and the two paths
 along the row, and selects. The two never meet in a row, so two threads give what one thread gives, bit for bit.
 """
 
@@ -19,7 +19,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.aggregation._paths import CHUNK, PathBuffers, Penalties, finish_part, first_visit, prepare_rows, start
+from stereokit.aggregation.paths.penalties import Penalties
+from stereokit.aggregation.paths.steps import PathBuffers
+from stereokit.aggregation.paths.visits import CHUNK, finish_part, first_visit, prepare_rows, start
 from stereokit.costs.rows import WORST, Cost, Levels
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer, check_number
@@ -29,7 +31,7 @@ from stereokit.kernels.threads import run_stages
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
-from stereokit.selection.wta import Winners, select_row
+from stereokit.selection.wta import SelectionOutput, select_row
 
 __all__ = ["Sgm"]
 
@@ -57,7 +59,7 @@ class Sgm:
         Grey difference of two neighbours, in levels of 0..255, from which the penalties of the step between them
         are lower: disparity jumps where the image does (Hirschmueller 2008, section II-B, in two levels).
     edge_factor : float
-        What the penalties are multiplied by there, 0 to 1; 1 for penalties that do not follow the image.
+        Factor of the penalties there, 0 to 1; 1 for penalties that do not follow the image.
     """
 
     p1: float | None = None
@@ -109,7 +111,7 @@ class Sgm:
 
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
-        threads: int, out: Winners, total: NDArray[np.uint16] | None = None,
+        threads: int, out: SelectionOutput, total: NDArray[np.uint16] | None = None,
     ) -> None:  # fmt: skip
         """Aggregate the rows of two producers and select.
 
@@ -127,20 +129,20 @@ class Sgm:
             Buffers.
         threads : int
             1 or more; two are used.
-        out : Winners
-            Where selection goes.
+        out : SelectionOutput
+            Maps of the selection.
         total : (H, W, P) uint16 or None
-            Where the sums over all paths go, if they are wanted.
+            Volume for the sums over all paths, if they are wanted.
         """
         height = guide.shape[0]
-        key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.dear
-        penalties, sums, workers = workspace.once(
+        key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.costly_to_recompute
+        penalties, sums, workers = workspace.cached(
             "sgm", key, lambda: self._buffers(guide.shape, levels, cost, workspace)
         )
-        keep = np.empty(0, np.uint16) if total is None else total.reshape(-1)
+        total_out = np.empty(0, np.uint16) if total is None else total.reshape(-1)
         if len(workers) == 1:
             start(workers[0])
-            _last_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out, keep)
+            _last_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out, total_out)
             return
         middle = height // 2
 
@@ -151,7 +153,7 @@ class Sgm:
 
         def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
             with span("match", "sweep: last visit"):
-                _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, keep)
+                _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, total_out)
 
         run_stages(
             [
@@ -169,34 +171,35 @@ class Sgm:
         height, width = shape
         size = width * levels.padded
         diagonals = self.paths != 4
-        most = int(max(penalties.p2, penalties.p2_edge))
+        two_sweeps = self.paths != 5
+        most = int(max(penalties.p2, penalties.p2_edge))  # largest bracket
         sums_dtype = np.uint8 if (3 if diagonals else 1) * most <= 255 else np.uint16
         across_dtype = np.uint8 if 2 * most <= 255 else np.uint16
-        both = self.paths != 5
-        sums = workspace.array("sgm.sums", height * size if both else 1, sums_dtype)
-        kept = workspace.array("sgm.kept", height * width if self.paths == 4 and cost.dear else 0, np.uint8)
+        sums = workspace.array("sgm.sums", height * size if two_sweeps else 1, sums_dtype)
+        recovers = self.paths == 4 and cost.costly_to_recompute
+        path_minimum = workspace.array("sgm.path_minimum", height * width if recovers else 0, np.uint8)
         whole = levels.count == levels.padded  # or the 255 of levels that pad would wrap, and might win
         padding = np.zeros(levels.padded, np.uint8)
         padding[levels.count :] = WORST
         workers = [
             PathBuffers(
-                tuple(range(levels.padded // LANES)),
-                diagonals,
-                self.paths,
-                width,
-                whole and self.paths == 4 and 4 * cost.cost_max + most <= 255,
-                whole and (5 if diagonals else 3) * most + (cost.cost_max if kept.size else 0) <= 255,
-                workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
-                workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
-                workspace.array(f"sgm.chains{k}", 4 * levels.padded, np.uint8),
-                workspace.array(f"sgm.state{k}", 3 * size, np.uint8),
-                workspace.array(f"sgm.least{k}", 3 * width, np.uint8),
-                workspace.array(f"sgm.penalties{k}", 16 * width, np.uint8),
-                workspace.array(f"sgm.total{k}", CHUNK * levels.padded, np.uint16),
-                kept,
-                padding,
+                blocks=tuple(range(levels.padded // LANES)),
+                diagonals=diagonals,
+                paths=self.paths,
+                width=width,
+                byte_costs=whole and self.paths == 4 and 4 * cost.cost_max + most <= 255,
+                byte_brackets=whole and (5 if diagonals else 3) * most + (cost.cost_max if recovers else 0) <= 255,
+                cost=workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
+                across=workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
+                chains=workspace.array(f"sgm.chains{k}", 4 * levels.padded, np.uint8),
+                state=workspace.array(f"sgm.state{k}", 3 * size, np.uint8),
+                lowest=workspace.array(f"sgm.lowest{k}", 3 * width, np.uint8),
+                penalties=workspace.array(f"sgm.penalties{k}", 16 * width, np.uint8),
+                total=workspace.array(f"sgm.total{k}", CHUNK * levels.padded, np.uint16),
+                path_minimum=path_minimum,
+                padding=padding,
             )
-            for k in range(2 if both else 1)
+            for k in range(2 if two_sweeps else 1)
         ]
         return penalties, sums, workers
 
@@ -204,18 +207,22 @@ class Sgm:
 @kernel
 def _last_visit(
     rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, step: int,
-    k0: int, sums: NDArray[Any], stored: bool, out: Winners, total: NDArray[np.uint16],
+    k0: int, sums: NDArray[Any], both: bool, out: SelectionOutput, total: NDArray[np.uint16],
 ) -> None:  # fmt: skip
+    """Sweep from row `y0` to before row `y1`, sum all paths and select; `k0` rows came before in this sweep.
+
+    If there are `both` sweeps, the other one left its part in `sums`. The sums also go to `total`, unless it is empty.
+    """
     padded = LANES * len(buffers.blocks)
     visits = abs(y1 - y0)
     for k in range(visits):
         y = y0 + k * step
-        slot = k % 2
-        if slot == 0:
+        half = k % 2
+        if half == 0:
             prepare_rows(rows, buffers, guide, penalties, y, step, min(2, visits - k), sums)
         for x0 in range(0, buffers.width, CHUNK):
             x1 = min(x0 + CHUNK, buffers.width)
-            finish_part(buffers, slot, y, k0 + k, x0, x1, sums, stored)
+            finish_part(buffers, half, y, k0 + k, x0, x1, sums, both)
             if total.size > 0:
                 for at in range(0, (x1 - x0) * padded, LANES):
                     store(total, (y * buffers.width + x0) * padded + at, load(buffers.total, at))

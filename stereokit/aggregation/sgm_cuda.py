@@ -8,7 +8,7 @@ last path nor the sum is ever stored. Both ask for the words of the next pixel b
 
 A line along the image's height begins at every column, whatever its slant: where it leaves the image on one side it
 goes on as a new path on the other one. So all lines of a direction are equally long and every pixel lies on one.
-The levels that pad cost 255, and from an existing level look as dear as P2 or more, as on the CPU.
+The levels that pad cost 255, and from an existing level seem to cost P2 or more, as on the CPU.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.aggregation._paths import Penalties
+from stereokit.aggregation.paths.penalties import Penalties
 from stereokit.aggregation.sgm import Sgm
 from stereokit.costs.rows import Cost
 from stereokit.cuda.kernel import (
@@ -85,11 +85,11 @@ def _words_loader(words: int) -> Any:
 @cache
 def _finder(padded: int) -> Any:
     """Return the helper that returns the first word of a lane of a group at a pixel."""
-    _, held = group_of(padded)
+    _, per_lane = group_of(padded)
 
     @device
     def words_at(pixel, place):  # type: ignore[no-untyped-def]
-        return u64(u32(u32(pixel * u32(padded // 4)) + u32(place * i32(held // 4))))
+        return u64(u32(u32(pixel * u32(padded // 4)) + u32(place * i32(per_lane // 4))))
 
     return words_at
 
@@ -97,22 +97,22 @@ def _finder(padded: int) -> Any:
 @cache
 def _stepper(padded: int) -> Any:
     """Return the helper that takes a path one pixel further, in place; it returns the smallest path cost."""
-    lanes, held = group_of(padded)
+    lanes, per_lane = group_of(padded)
     lowest_of = lowest_of_group(lanes)
 
     @device
     def step(path, costs, low, p1, p2, place):  # type: ignore[no-untyped-def]
-        below = shuffle_up(path[held - 1], 1)
-        beyond = shuffle_down(path[0], 1)
+        below = shuffle_up(path[per_lane - 1], 1)
+        above_last = shuffle_down(path[0], 1)
         if place == 0:
             below = i32(_FAR)
         if place == i32(lanes - 1):
-            beyond = i32(_FAR)
+            above_last = i32(_FAR)
         up = i32(p1 - low)
         smallest = i32(_FAR)
-        for k in range(held):
+        for k in range(per_lane):
             here = path[k]
-            above = path[k + 1] if k < held - 1 else beyond
+            above = path[k + 1] if k < per_lane - 1 else above_last
             bracket = min(min(i32(min(below, above) + up), i32(here - low)), p2)
             cost = i32(u32(costs[k // 4] >> u32(8 * (k % 4))) & u32(255))
             path[k] = i32(cost + bracket)
@@ -129,8 +129,8 @@ def paths_kernel(padded: int) -> Kernel:
 
     `table` has dx, dy and the first block of each direction.
     """
-    lanes, held = group_of(padded)
-    words = held // 4
+    lanes, per_lane = group_of(padded)
+    words = per_lane // 4
     span = padded // 4
     lines_of_block = 128 // lanes
     words_at = _finder(padded)
@@ -162,10 +162,10 @@ def paths_kernel(padded: int) -> Kernel:
             x = i32(0) if dx > 0 else i32(width - 1)
             y = line
         base = u64(u64(direction) * u64(u32(u32(height) * u32(width) * u32(span))))
-        path = cuda.local.array(held, i32)
+        path = cuda.local.array(per_lane, i32)
         coming = cuda.local.array(words, u32)
         present = cuda.local.array(words, u32)
-        for k in range(held):
+        for k in range(per_lane):
             path[k] = i32(0)
         low = i32(0)
         at = u32(u32(u32(y) * u32(width)) + u32(x))
@@ -206,33 +206,33 @@ def paths_kernel(padded: int) -> Kernel:
                         out[base + to + u64(j)] = present[j]
             if wrapped:
                 low = i32(0)
-                for k in range(held):
+                for k in range(per_lane):
                     path[k] = i32(0)
 
-    made: Kernel = sgm_paths
-    return made
+    result: Kernel = sgm_paths
+    return result
 
 
 @cache
 def final_kernel(padded: int, others: int) -> Kernel:
     """Return the kernel that walks the columns, `dy` at a time, adds `others` paths and selects."""
-    lanes, held = group_of(padded)
-    words = held // 4
+    lanes, per_lane = group_of(padded)
+    words = per_lane // 4
     span = padded // 4
     lines_of_block = 128 // lanes
     words_at = _finder(padded)
     load = _words_loader(words)
     step = _stepper(padded)
     choose = selector(padded, False)
-    stored_words = words * others
+    path_words = words * others
     even = np.uint32(0x00FF00FF)
     maps = array(f32), array(u16), array(f32), *RULES
     types = array(u32), array(u8), array(u32), i32, i32, i32
 
     @kernel(*types, *_PENALTIES, *maps, block=128, name=f"sgm_final_{padded}_{others + 1}")
     def sgm_final(  # type: ignore[no-untyped-def]
-        costs, guide, stored, dy, height, width, edge, p1, p2, p1_edge, p2_edge,
-        disparity, cost, confidence, levels, minimum, subpixel, uniqueness, confident,
+        costs, guide, path_costs, dy, height, width, edge, p1, p2, p1_edge, p2_edge,
+        disparity, cost, confidence, levels, minimum, subpixel, uniqueness, detail,
     ):  # fmt: skip
         thread = i32(cuda.threadIdx.x)
         lane = i32(thread & i32(31))
@@ -242,20 +242,20 @@ def final_kernel(padded: int, others: int) -> Kernel:
         x = i32(min(x, i32(width - 1)))
         y = i32(0) if dy > 0 else i32(height - 1)
         volume = u64(u32(u32(height) * u32(width) * u32(span)))
-        path = cuda.local.array(held, i32)
-        total = cuda.local.array(held, i32)
+        path = cuda.local.array(per_lane, i32)
+        total = cuda.local.array(per_lane, i32)
         coming = cuda.local.array(words, u32)
         present = cuda.local.array(words, u32)
-        ahead = cuda.local.array(stored_words, u32)
+        ahead = cuda.local.array(path_words, u32)
         part = cuda.local.array(words, u32)
-        for k in range(held):
+        for k in range(per_lane):
             path[k] = i32(0)
         low = i32(0)
         at = u32(u32(u32(y) * u32(width)) + u32(x))
         load(costs, words_at(at, place), coming)
         before = i32(guide[at])
         for n in range(others):
-            load(stored, words_at(at, place) + u64(n) * volume, part)
+            load(path_costs, words_at(at, place) + u64(n) * volume, part)
             for j in range(words):
                 ahead[n * words + j] = part[j]
         for _ in range(height):
@@ -276,7 +276,7 @@ def final_kernel(padded: int, others: int) -> Kernel:
             source = words_at(at, place)
             load(costs, source, coming)
             for n in range(others):
-                load(stored, source + u64(n) * volume, part)
+                load(path_costs, source + u64(n) * volume, part)
                 for j in range(words):
                     ahead[n * words + j] = part[j]
             jump = i32(abs(i32(grey - before)))
@@ -284,14 +284,14 @@ def final_kernel(padded: int, others: int) -> Kernel:
             small = p1_edge if jump >= edge else p1
             large = p2_edge if jump >= edge else p2
             low = step(path, present, low, small, large, place)
-            for k in range(held):
+            for k in range(per_lane):
                 total[k] = i32(total[k] + path[k])
             choose(
-                total, lane, pixel, alive, disparity, cost, confidence, levels, minimum, subpixel, uniqueness, confident
+                total, lane, pixel, alive, disparity, cost, confidence, levels, minimum, subpixel, uniqueness, detail
             )
 
-    made: Kernel = sgm_final
-    return made
+    result: Kernel = sgm_final
+    return result
 
 
 for _padded, _others in ((32, 3), (64, 3), (128, 3), (128, 4), (128, 7), (512, 7)):
@@ -316,11 +316,11 @@ def aggregate(
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     sgm : Sgm
         Options.
     cost : Cost
-        What made the volume.
+        Cost of the volume.
     costs : (H * W * padded / 4,) uint32
         The volume (`stereokit.costs.rows_cuda`); not modified.
     guide : (H * W,) uint8
@@ -330,7 +330,7 @@ def aggregate(
     padded : int
         Levels of the volume.
     maps : Maps
-        Where selection goes.
+        Maps of the selection.
     """
     penalties: Penalties = sgm.penalties(cost.cost_max, cost.unit)
     steps = penalties.edge, penalties.p1, penalties.p2, penalties.p1_edge, penalties.p2_edge
@@ -338,10 +338,10 @@ def aggregate(
     per_block = 128 // lanes
     others = sgm.paths - 1
     rows, blocks = _table(sgm.paths, shape, per_block)
-    table = queue.once("sgm.table", (sgm.paths, shape, padded), lambda: rows)
-    stored = queue.array("sgm.paths", others * shape[0] * shape[1] * padded // 4, np.uint32)
+    table = queue.cached("sgm.table", (sgm.paths, shape, padded), lambda: rows)
+    path_costs = queue.array("sgm.paths", others * shape[0] * shape[1] * padded // 4, np.uint32)
     numbers = [int(step) for step in steps]
-    queue.launch(paths_kernel(padded), blocks, costs, guide, table, others, stored, *shape, *numbers)
+    queue.launch(paths_kernel(padded), blocks, costs, guide, table, others, path_costs, *shape, *numbers)
     final = final_kernel(padded, others)
     dy = directions(sgm.paths)[-1][1]
-    queue.launch(final, blocks_for(shape[1], per_block), costs, guide, stored, dy, *shape, *numbers, *maps)
+    queue.launch(final, blocks_for(shape[1], per_block), costs, guide, path_costs, dy, *shape, *numbers, *maps)

@@ -1,13 +1,12 @@
 """The command line: ``stereokit match``, ``list``, ``info`` and the commands of other packages.
 
 Other packages add commands through the entry-point group ``stereokit.commands``: each entry is a plain
-function with typer annotations. It is imported only when its command (or the list of all commands) is asked
-for, and one that cannot be imported says so without harming the rest. Everything heavy is imported inside the
-functions.
+function with typer annotations. It is imported only for its command or for the list of all commands. One that cannot
+be imported reports its error without harm to the rest. Everything heavy is imported inside the functions.
 
-Bad input ends with one line, ``error: ...``, on standard error and exit status 2; an interrupt with 130. What looks
-wrong but stops nothing is one line, ``warning: ...``. A request to end (SIGTERM, SIGHUP) is an interrupt, so that no
-half-written file stays behind, and the process then ends by that signal.
+Bad input ends with one line, ``error: ...``, on standard error and exit status 2; an interrupt with 130. A warning is
+one line, ``warning: ...``. A request to end (SIGTERM, SIGHUP) is an interrupt, so that no half-written file stays
+behind, and the process then ends by that signal.
 """
 
 from __future__ import annotations
@@ -30,6 +29,9 @@ from typer.core import TyperGroup
 from stereokit.cli.info import info, list_
 from stereokit.cli.match import match
 from stereokit.cli.output import version_of
+from stereokit.cli.pair import check
+from stereokit.cli.rig import rig
+from stereokit.cli.warmup import warmup
 from stereokit.errors import StereokitError, one_line
 from stereokit.notices import collecting
 
@@ -39,11 +41,11 @@ _GROUP = "stereokit.commands"
 
 
 class _Commands(TyperGroup):
-    """The built-in commands and those found through entry points."""
+    """The built-in commands and those of entry points."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        own = super().list_commands(ctx)
-        return [*own, *sorted({entry.name for entry in metadata.entry_points(group=_GROUP)} - set(own))]
+        names = super().list_commands(ctx)
+        return [*names, *sorted({entry.name for entry in metadata.entry_points(group=_GROUP)} - set(names))]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         command = super().get_command(ctx, cmd_name)
@@ -54,7 +56,7 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            with collecting(_tell):
+            with collecting(_print_warning):
                 return super().invoke(ctx)
         except StereokitError as error:
             _fail(str(error), error)
@@ -85,11 +87,11 @@ def main() -> None:
 
     keep_stderr()
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a path may hold what is no text
+        sys.stdout.reconfigure(errors="backslashreplace")  # a path may have bytes that are no text
     if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # what libraries have to say to programmers
+        warnings.simplefilter("ignore")  # warnings of libraries are for programmers
         warnings.filterwarnings("default", module="stereokit")
-    warnings.showwarning = lambda message, *_, **__: _tell(str(message))
+    warnings.showwarning = lambda message, *_, **__: _print_warning(str(message))
     with _ending_by_signal():
         try:
             app(prog_name="stereokit")
@@ -99,12 +101,12 @@ def main() -> None:
 
 @contextmanager
 def _ending_by_signal() -> Iterator[None]:
-    """Take a request to end as an interrupt, so that what is under way is cleared away, and then end by it."""
-    received: list[int] = []
+    """Turn a request to end into an interrupt, so that running work is cleaned up, and then end by its signal."""
+    signals: list[int] = []
 
     def end(number: int, frame: object) -> None:
-        received.append(number)
-        if len(received) == 1:  # it may come again meanwhile, as from `timeout`
+        signals.append(number)
+        if len(signals) == 1:  # it may come again meanwhile, as from `timeout`
             raise KeyboardInterrupt
 
     if threading.current_thread() is threading.main_thread():
@@ -115,9 +117,9 @@ def _ending_by_signal() -> Iterator[None]:
     try:
         yield
     finally:
-        if received:
-            signal.signal(received[0], signal.SIG_DFL)
-            os.kill(os.getpid(), received[0])
+        if signals:
+            signal.signal(signals[0], signal.SIG_DFL)
+            os.kill(os.getpid(), signals[0])
 
 
 def _print_version(wanted: bool) -> None:
@@ -136,29 +138,32 @@ def _root(
 
 
 app.command()(match)
+app.command()(check)
 app.command("list")(list_)
 app.command()(info)
+app.command()(warmup)
+app.command()(rig)
 
 
 def _plugin(entry: metadata.EntryPoint) -> Any:
-    single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     try:
         function: Callable[..., Any] = entry.load()
         summary = (inspect.getdoc(function) or "").split("\n\nParameters\n")[0]  # the rest is for programmers
-        single.command(entry.name, help=summary)(function)
-        command = typer.main.get_command(single)
+        app.command(entry.name, help=summary)(function)
+        command = typer.main.get_command(app)
     except Exception as error:
         reason = f"command {entry.name!r} cannot be loaded: {type(error).__name__}: {error}"
 
         def unavailable(ctx: typer.Context) -> None:
             raise StereokitError(reason)
 
-        single = typer.Typer(add_completion=False, rich_markup_mode=None)
-        anything = {"allow_extra_args": True, "ignore_unknown_options": True}
-        single.command(entry.name, help=f"Not available: {reason}", context_settings=anything, add_help_option=False)(
+        app = typer.Typer(add_completion=False, rich_markup_mode=None)
+        any_arguments = {"allow_extra_args": True, "ignore_unknown_options": True}
+        app.command(entry.name, help=f"Not available: {reason}", context_settings=any_arguments, add_help_option=False)(
             unavailable
         )
-        command = typer.main.get_command(single)
+        command = typer.main.get_command(app)
     command.name = entry.name
     return command
 
@@ -168,5 +173,5 @@ def _fail(message: str, error: BaseException) -> None:
     raise typer.Exit(2) from error
 
 
-def _tell(line: str) -> None:
+def _print_warning(line: str) -> None:
     typer.echo(f"warning: {one_line(line)}", err=True)

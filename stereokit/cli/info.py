@@ -1,4 +1,4 @@
-"""The commands ``stereokit list`` and ``stereokit info``: what there is, here."""
+"""The commands ``stereokit list`` and ``stereokit info``: methods and stages, versions and devices."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STAGE_NAMES = {
 
 
 def list_(json_file: JsonOption = None) -> None:
-    """List the methods and the stages they are made of."""
+    """List the methods and their stages."""
     check_json(json_file)
     from stereokit.matching import METHODS
     from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
@@ -32,10 +32,10 @@ def list_(json_file: JsonOption = None) -> None:
     table = Table("Method", "Stages", "What it is")
     for name, entry in methods.items():
         table.add_row(name, entry["method"], entry["description"])
-    parts = Table("Stage", "Names")
+    stage_table = Table("Stage", "Names")
     for kind, names in stages.items():
-        parts.add_row(kind, ", ".join(names) or "none")
-    report({"methods": methods, **stages}, [table, parts], json_file)
+        stage_table.add_row(kind, ", ".join(names) or "none")
+    report({"methods": methods, **stages}, [table, stage_table], json_file)
 
 
 def info(json_file: JsonOption = None) -> None:
@@ -61,13 +61,13 @@ def info(json_file: JsonOption = None) -> None:
         "processor": str(llvmlite.binding.get_host_cpu_name()),
         "vector_bits": None if vector_bits is None else vector_bits(),
         "threads": threads.available_threads(),
-        "numba_cache": numba.config.CACHE_DIR or "beside the modules, in __pycache__",
+        "numba_cache": numba.config.CACHE_DIR or "in __pycache__ of the modules",
         "cuda": driver.has_device(),
         "gpu": driver.describe(),
         "numba_cuda": version_of("numba-cuda"),
     }
     table = Table("What", "Value")
     for name, value in content.items():
-        shown = {None: "not known" if name == "vector_bits" else "not installed", True: "yes", False: "no"}
-        table.add_row(name, shown[value] if value is None or isinstance(value, bool) else str(value))
+        words = {None: "not known" if name == "vector_bits" else "not installed", True: "yes", False: "no"}
+        table.add_row(name, words[value] if value is None or isinstance(value, bool) else str(value))
     report(content, [table], json_file)

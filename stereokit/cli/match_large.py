@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from stereokit.cli.options import described
+from stereokit.cli.options import matcher_report
 from stereokit.cli.output import Table
 from stereokit.large.matching import OVERLAP, match_large
 
@@ -61,7 +61,7 @@ def match_in_windows(
         "outputs": {"output": str(output)},
         "width": result.width,
         "height": result.height,
-        **described(matcher),
+        **matcher_report(matcher),
         "memory": memory,
         "overlap": result.overlap,
         "windows": result.windows,

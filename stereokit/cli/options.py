@@ -1,4 +1,4 @@
-"""What the commands of all packages share: ``--set KEY=VALUE``, ``--json FILE`` and how results leave.
+"""Options that the commands of all packages share, such as ``--set KEY=VALUE`` and ``--json FILE``.
 
 Everything heavy is imported inside the functions: commands are loaded to print their help.
 """
@@ -31,12 +31,12 @@ __all__ = [
     "WeightsOption",
     "check_fits_png",
     "check_json",
-    "described",
+    "matcher_report",
     "parse_settings",
     "write_json",
 ]
 
-_OWN_OPTIONS = frozenset(  # not through --set
+_RESERVED_OPTIONS = frozenset(  # not through --set
     "method max_disparity min_disparity scale refiner weights fill threads device right confidence".split()
 )
 MethodOption = Annotated[str, typer.Option("--method", "-m", help="cost+aggregation, S1 to S4.")]
@@ -50,44 +50,44 @@ DeviceOption = Annotated[str, typer.Option(help="auto (the CPU, for now), cpu or
 SettingsOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage, such as p1=10.")
 ]
-"""Types of the parameters that commands which match have in common; the defaults are theirs."""
+"""Types of the parameters that the matching commands share; each command has its own defaults."""
 JsonOption = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - prints it.")
 ]
 """The type of a command's ``--json`` parameter, whose default is None."""
 
 
-def parse_settings(settings: Iterable[str], own: frozenset[str] = _OWN_OPTIONS) -> dict[str, Any]:
+def parse_settings(settings: Iterable[str], reserved: frozenset[str] = _RESERVED_OPTIONS) -> dict[str, Any]:
     """Return the options of ``--set KEY=VALUE``: whole numbers, finite numbers, true, false, none or text.
 
     Parameters
     ----------
     settings : iterable of str
-        As given on the command line.
-    own : frozenset of str
-        Names that have an option of their own and are refused here.
+        The values on the command line.
+    reserved : frozenset of str
+        Names with an option of their own, which are refused here.
 
     Raises
     ------
     OptionError
-        If one is not ``KEY=VALUE``, is given twice, or has an option of its own.
+        If one is not ``KEY=VALUE``, appears twice, or has an option of its own.
     """
     options: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = setting.partition("=")
+    for text in settings:
+        key, separator, value = text.partition("=")
         key = key.strip().replace("-", "_")
-        if not equals or not key.isidentifier():
-            raise OptionError(f"--set must be KEY=VALUE, got {setting!r}")
-        if key in own:
+        if not separator or not key.isidentifier():
+            raise OptionError(f"--set must be KEY=VALUE, got {text!r}")
+        if key in reserved:
             raise OptionError(f"--set {key}: use --{key.replace('_', '-')} instead")
         if key in options:
             raise OptionError(f"--set {key} must be given once, got it twice")
-        options[key] = _value(text.strip())
+        options[key] = _value(value.strip())
     return options
 
 
 def check_fits_png(name: str, min_disparity: int, max_disparity: int) -> None:
-    """Refuse disparities that a KITTI png does not hold, for the option `name`.
+    """Refuse disparities beyond the range of a KITTI png, for the option `name`.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def check_fits_png(name: str, min_disparity: int, max_disparity: int) -> None:
 
 
 def check_json(path: Path | None) -> dict[str, Path]:
-    """Check ``--json`` before any work is done for it; return it under its name, or nothing if it is no file.
+    """Check ``--json`` before any work; return its path under its name, or an empty dict if it is no file.
 
     Raises
     ------
@@ -134,8 +134,8 @@ def write_json(path: Path | None, content: dict[str, Any]) -> bool:
     return False
 
 
-def described(matcher: Matcher) -> dict[str, Any]:
-    """Return what the reports of commands say of a matcher."""
+def matcher_report(matcher: Matcher) -> dict[str, Any]:
+    """Return the entries of a command's report about its matcher."""
     names = ("method", "max_disparity", "min_disparity", "scale", "refiner", "device")
     return {name: getattr(matcher, name) for name in names}
 

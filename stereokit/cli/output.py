@@ -1,4 +1,4 @@
-"""What commands show: tables or JSON, a spinner while something takes long, versions."""
+"""Output of commands: tables or JSON, a spinner during long work, versions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rich import table
+import rich.table
 from rich.console import Console
 from rich.text import Text
 
@@ -19,19 +19,19 @@ from stereokit.errors import one_line
 __all__ = ["Table", "report", "version_of", "waiting"]
 
 
-class Table(table.Table):
-    """A table of words as they are: paths and names may hold what looks like rich's markup, or cannot be printed."""
+class Table(rich.table.Table):
+    """A table of plain text: rich's markup in paths and names has no effect, and unprintable characters are escaped."""
 
     def __init__(self, *heads: str, title: str | None = None, **options: Any) -> None:
         super().__init__(*heads, title=None if title is None else Text(one_line(title), "table.title"), **options)
 
     def add_column(self, header: Any = "", *arguments: Any, **options: Any) -> None:
-        """Add a column; its head is shown as it is, and what is too long for it goes on in the next line."""
+        """Add a column with a plain head; long cells are folded."""
         options.setdefault("overflow", "fold")
         super().add_column(Text(header) if isinstance(header, str) else header, *arguments, **options)
 
     def add_row(self, *cells: Any, **options: Any) -> None:
-        """Add a row; what is no renderable of rich's is shown as it is."""
+        """Add a row; strings are plain text, rich's own objects are rendered."""
         super().add_row(*(Text(one_line(cell)) if isinstance(cell, str) else cell for cell in cells), **options)
 
 
@@ -48,12 +48,12 @@ def version_of(package: str) -> str | None:
 
 
 def report(content: dict[str, Any], tables: list[Table], path: Path | None) -> None:
-    """Write `content` as JSON, or print the tables where no file was asked for."""
+    """Write `content` as JSON, or print the tables where there is no JSON file."""
     if write_json(path, content):
         return
     console = Console()
-    for part in tables:
-        console.print(part)
+    for table in tables:
+        console.print(table)
 
 
 @contextmanager

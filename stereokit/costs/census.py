@@ -3,7 +3,7 @@
 Bit ``k`` of a pixel's census tells whether neighbour ``k`` of its window is darker, ``I(q) < I(p)``; the cost of a
 match is the number of bits that differ. All neighbours of the window count (62 of 9x7). Borders are clamped.
 
-The bits are kept as byte planes, eight neighbours to a plane: then the Hamming distances of 64 levels are, plane
+The bits lie in byte planes, eight neighbours to a plane: then the Hamming distances of 64 levels are, plane
 by plane, one load, one exclusive or, one population count and one addition of bytes.
 
 Bound and measurement: 5x5 has 3 planes, so 64 cells take 9 operations on 512-bit vectors, 3 loads and a store, or
@@ -20,10 +20,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements, pad_pair
+from stereokit.costs.rows import CellMask, CostInput, cell_mask, implements, mask_row, pad_pair
 from stereokit.errors import OptionError, shown
 from stereokit.kernels.jit import kernel
-from stereokit.kernels.simd import LANES, add, count_bits, either, less_bit, load, splat, store, xor
+from stereokit.kernels.simd import LANES, add, bitwise_or, count_bits, load, mark_less, splat, store, xor
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import COSTS
@@ -36,7 +36,7 @@ WINDOWS = {"5x5": (5, 5), "7x7": (7, 7), "9x7": (9, 7)}
 class CensusRows(NamedTuple):
     """Byte planes of both images, for `cost_row`."""
 
-    cells: Cells
+    cells: CellMask
     planes: tuple[int, ...]  # 0, 1, ..: its length is known to the compiler
     left: NDArray[np.uint8]  # element (y * planes + p) * left_stride + x
     left_stride: int
@@ -70,16 +70,22 @@ class Census:
         return width * height - 1
 
     @property
+    def reach(self) -> tuple[int, int]:
+        """Half of the window across and down, pixels."""
+        width, height = WINDOWS[self.window]
+        return width // 2, height // 2
+
+    @property
     def unit(self) -> int:
         """Penalties are given in neighbours that differ: one unit of cost."""
         return 1
 
     @property
-    def dear(self) -> bool:
+    def costly_to_recompute(self) -> bool:
         """Whether a row costs more to compute again than to bring back from a volume."""
         return self.window == "9x7"
 
-    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[CensusRows]:
+    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[CensusRows]:
         """Transform both images; return the row producers of `workers` sweeps."""
         height, width = pair.left.shape
         across, down = (size // 2 for size in WINDOWS[self.window])
@@ -99,8 +105,15 @@ class Census:
             tasks.append(partial(_transform, *left_image, dy, dx, y0, y1, left_planes, left_stride))
             tasks.append(partial(_transform, *right_image, dy, -dx, y0, y1, right_planes, right_stride))
         run(tasks, pair.threads)
-        cells = cells_of(pair, self.cost_max, workspace)
-        rows = CensusRows(cells, tuple(range(planes)), left_planes, left_stride, right_planes, right_stride)
+        cells = cell_mask(pair, self.cost_max, workspace)
+        rows = CensusRows(
+            cells=cells,
+            planes=tuple(range(planes)),
+            left=left_planes,
+            left_stride=left_stride,
+            right=right_planes,
+            right_stride=right_stride,
+        )
         return [rows] * workers
 
 
@@ -118,7 +131,7 @@ def _transform(
                 bits = splat(np.uint8(0))
                 for k in range(8 * plane, min(8 * plane + 8, dy.size)):
                     neighbour = load(image, at + dy[k] * image_stride + dx[k])
-                    bits = either(bits, less_bit(neighbour, centre, np.uint8(1 << (k - 8 * plane))))
+                    bits = bitwise_or(bits, mark_less(neighbour, centre, np.uint8(1 << (k - 8 * plane))))
                 store(out, (y * planes + plane) * out_stride + x, bits)
 
 
@@ -135,8 +148,8 @@ def _census_row(rows: CensusRows, y: int, out: NDArray[np.uint8]) -> None:
             block = n * LANES
             cost = splat(np.uint8(0))
             for p in range(planes):
-                mine = splat(rows.left[left + p * rows.left_stride + x])
-                theirs = load(rows.right, right + p * rows.right_stride + k + block)
-                cost = add(cost, count_bits(xor(mine, theirs)))
+                left_bits = splat(rows.left[left + p * rows.left_stride + x])
+                right_bits = load(rows.right, right + p * rows.right_stride + k + block)
+                cost = add(cost, count_bits(xor(left_bits, right_bits)))
             store(out, x * LANES * len(cells.blocks) + block, cost)
-    close_row(cells, y, out)
+    mask_row(cells, y, out)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stereokit.costs.census import WINDOWS, Census
-from stereokit.costs.rows_cuda import EVIDENCE, Scene, held, masked_cost, padding
+from stereokit.costs.rows_cuda import EVIDENCE, DevicePair, apply_border, masked_cost, padding
 from stereokit.cuda.kernel import Kernel, Queue, array, blocks_for, cuda, i32, kernel, u32
 from stereokit.images.prepare_cuda import KINDS, clamped
 
@@ -60,8 +60,8 @@ def bits_kernel(window: str, dtype: np.dtype[Any]) -> Kernel:
                             bits = u32(0)
             out[at] = bits
 
-    made: Kernel = census_bits
-    return made
+    result: Kernel = census_bits
+    return result
 
 
 @cache
@@ -71,7 +71,7 @@ def costs_kernel(words: int, masked: bool) -> Kernel:
 
     @kernel(array(u32), array(u32), array(u32), *EVIDENCE, block=128, name=name)
     def census_costs(  # type: ignore[no-untyped-def]
-        left, right, volume, bad, height, width, span, count, minimum, outside, beyond
+        left, right, volume, bad, height, width, span, count, minimum, border_cost, clamp_border
     ):
         at = u32(cuda.grid(1))
         strips = u32(u32(width + STRIP - 1) // u32(STRIP))
@@ -95,7 +95,7 @@ def costs_kernel(words: int, masked: bool) -> Kernel:
                 for k in range(3):
                     near[3 - k] = near[2 - k]
                 near[0] = right[u]
-                mine = left[pixel]
+                left_bits = left[pixel]
                 also = u32(0)
                 if words == 2:
                     for k in range(3):
@@ -104,20 +104,20 @@ def costs_kernel(words: int, masked: bool) -> Kernel:
                     also = left[u32(u32(u32(height) * u32(width)) + pixel)]
                 packed = pads
                 for k in range(4):
-                    cost = i32(cuda.popc(u32(mine ^ near[k])))
+                    cost = i32(cuda.popc(u32(left_bits ^ near[k])))
                     if words == 2:
                         cost = i32(cost + i32(cuda.popc(u32(also ^ far[k]))))
                     column = i32(i32(x) - level - i32(k) - minimum)
-                    cost = held(cost, column, width, outside, beyond)
+                    cost = apply_border(cost, column, width, border_cost, clamp_border)
                     if masked:
-                        cost = masked_cost(cost, column, y, x, bad, height, width, outside)
+                        cost = masked_cost(cost, column, y, x, bad, height, width, border_cost)
                     packed = u32(packed | u32(u32(cost) << u32(8 * k)))
                 volume[u32(u32(pixel * u32(span)) + word)] = packed
                 pixel = u32(pixel + u32(1))
                 u = u32(u + u32(1))
 
-    made: Kernel = census_costs
-    return made
+    result: Kernel = census_costs
+    return result
 
 
 for _window in WINDOWS:
@@ -127,18 +127,18 @@ for _window in WINDOWS:
     costs_kernel(_words(_window), True)
 
 
-def volume(queue: Queue, cost: Census, scene: Scene) -> Any:
+def volume(queue: Queue, cost: Census, pair: DevicePair) -> Any:
     """Return the volume of costs of a pair, flat words on the device (`stereokit.costs.rows_cuda`)."""
-    height, width, words = scene.height, scene.width, _words(cost.window)
+    height, width, words = pair.height, pair.width, _words(cost.window)
     left = queue.array("census.left", words * height * width, np.uint32)
-    right = queue.array("census.right", words * height * scene.reach, np.uint32)
-    made = bits_kernel(cost.window, scene.dtype)
-    first = -scene.levels.minimum - (scene.padded - 1)
-    for place, start, columns, out in ((0, 0, width, left), (1, first, scene.reach, right)):
-        blocks = blocks_for(height * columns, made.block)
-        queue.launch(made, blocks, scene.images, place, start, columns, height, width, out)
-    out = queue.array("costs", height * width * scene.padded // 4, np.uint32)
-    costs = costs_kernel(words, scene.masked)
-    threads = height * -(-width // STRIP) * scene.padded // 4
-    queue.launch(costs, blocks_for(threads, costs.block), left, right, out, *scene.evidence(cost.cost_max))
+    right = queue.array("census.right", words * height * pair.reach, np.uint32)
+    bits = bits_kernel(cost.window, pair.dtype)
+    first = -pair.levels.minimum - (pair.padded - 1)
+    for place, start, columns, out in ((0, 0, width, left), (1, first, pair.reach, right)):
+        blocks = blocks_for(height * columns, bits.block)
+        queue.launch(bits, blocks, pair.images, place, start, columns, height, width, out)
+    out = queue.array("costs", height * width * pair.padded // 4, np.uint32)
+    costs = costs_kernel(words, pair.masked)
+    threads = height * -(-width // STRIP) * pair.padded // 4
+    queue.launch(costs, blocks_for(threads, costs.block), left, right, out, *pair.evidence(cost.cost_max))
     return out

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from stereokit.costs.rows import Pair, VolumeRows
+from stereokit.costs.rows import CostInput, VolumeRows
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer
 from stereokit.kernels.threads import run, spans
@@ -61,21 +61,21 @@ class RowCost:
         return True
 
     @property
-    def dear(self) -> bool:
+    def costly_to_recompute(self) -> bool:
         """Whether a row costs more to compute again than to bring back from a volume."""
         return False
 
-    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[VolumeRows]:
+    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[VolumeRows]:
         """Compute the cost volume; return its rows for `workers` sweeps."""
         height, width = pair.left.shape
         levels = pair.levels
         volume = workspace.array("custom.volume", (height, width, levels.count), np.uint8)
-        worst = np.uint8(self.cost_max if pair.outside is None else round(pair.outside * self.cost_max))
+        border_cost = np.uint8(self.cost_max if pair.border_share is None else round(pair.border_share * self.cost_max))
         columns = np.arange(width)[:, None] - np.arange(levels.count)[None, :] - levels.minimum
-        outside = (columns < 0) | (columns >= width)
+        no_match = (columns < 0) | (columns >= width)
         margin = 0
         left, right = pair.left, pair.right
-        if pair.outside is None:  # the function sees images that go on with their border pixels
+        if pair.border_share is None:  # the function sees images that go on with their border pixels
             margin = max(0, levels.minimum + levels.count - 1, -levels.minimum)
             left, right = (np.pad(image, ((0, 0), (margin, margin)), mode="edge") for image in (left, right))
 
@@ -83,16 +83,16 @@ class RowCost:
             wide = np.empty((left.shape[1], levels.count), np.uint8)
             for y in range(y0, y1):
                 row = volume[y]
-                if pair.outside is None:
+                if pair.border_share is None:
                     self.function(left, right, y, levels.minimum, wide)
                     row[:] = wide[margin : margin + width]
                 else:
                     self.function(left, right, y, levels.minimum, row)
-                    np.copyto(row, worst, where=outside)
+                    np.copyto(row, border_cost, where=no_match)
                 if pair.right_bad is not None:
-                    np.copyto(row, worst, where=pair.right_bad[y, np.clip(columns, 0, width - 1)])
+                    np.copyto(row, border_cost, where=pair.right_bad[y, np.clip(columns, 0, width - 1)])
                 if pair.left_bad is not None:
-                    row[pair.left_bad[y]] = worst
+                    row[pair.left_bad[y]] = border_cost
 
         run([partial(fill, y0, y1) for y0, y1 in spans(height, pair.threads)], pair.threads)
         return [VolumeRows(volume, levels.padded)] * workers

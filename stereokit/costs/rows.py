@@ -1,10 +1,10 @@
-"""What every cost shares: the levels of disparity, the padded images, and how a row of costs is closed.
+"""The common part of all costs: levels of disparity, padded images, and the mask of the cells without evidence.
 
 A cost is a *producer of rows*. It prepares an image pair once and returns, for each worker, a named tuple of
 arrays; `cost_row` then writes the costs of row `y`, ``(W, P)`` ``uint8``, disparity innermost, when a sweep asks
 for it. Costs are cheap to compute again, so the cost volume is never stored.
 
-Which code `cost_row` runs is decided by the *type* of the named tuple when a sweep is compiled (see
+The *type* of the named tuple decides, when a sweep is compiled, which code `cost_row` runs (see
 `implements`): two producers times two sweeps are four specialisations of one source, and a third cost is one
 more file.
 
@@ -25,26 +25,24 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numba import types
-from numba.extending import overload
 from numpy.typing import NDArray
 
-from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.simd import LANES, either, load, maximum, minimum, splat, store
+from stereokit.kernels.jit import by_types, inline, kernel
+from stereokit.kernels.simd import LANES, bitwise_or, load, maximum, minimum, splat, store
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
 __all__ = [
     "WORST",
-    "Cells",
+    "CellMask",
     "Cost",
+    "CostInput",
     "Levels",
-    "Pair",
     "VolumeRows",
-    "cells_of",
-    "close_row",
+    "cell_mask",
     "cost_row",
     "implements",
+    "mask_row",
     "pad_pair",
     "produce_volume",
     "takes_8_bits",
@@ -68,7 +66,7 @@ class Levels:
 
 
 @dataclass(frozen=True)
-class Pair:
+class CostInput:
     """A checked image pair, ready for a cost.
 
     Attributes
@@ -79,11 +77,11 @@ class Pair:
         Pixels that were NaN or infinite and carry no evidence; None when there are none.
     levels : Levels
         Disparities to try.
-    outside : float or None
+    border_share : float or None
         Cost of a level whose right pixel lies outside the image, as a share of the cost's range; None takes
         the nearest border pixel instead.
     threads : int
-        How many threads preparation may use.
+        Threads that preparation may use.
     ranges : ((int, int), (int, int)) or None
         Smallest and largest value of the left and of the right image, where these are windows of larger ones; None
         where they are whole.
@@ -94,21 +92,21 @@ class Pair:
     left_bad: NDArray[np.bool_] | None
     right_bad: NDArray[np.bool_] | None
     levels: Levels
-    outside: float | None
+    border_share: float | None
     threads: int = 1
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
 
 class Cost(Protocol):
-    """What a matching cost offers: its range, the unit of its penalties, and rows.
+    """A matching cost: its range, the unit of its penalties, and rows.
 
     It may further have
 
-    - ``cuda``: the name of the module with its CUDA twin, whose ``volume(queue, cost, scene)`` returns the volume of
+    - ``cuda``: the name of the module with its CUDA twin, whose ``volume(queue, cost, pair)`` returns the volume of
       costs on the device as `stereokit.costs.rows_cuda` has it, and whose ``check(cost)``, if it has one, raises
       `stereokit.DeviceError` for options that the twin does not take. Without one, methods run on the CPU only;
-    - ``needs_ranges``: its costs depend on the smallest and largest values of the whole images (`Pair.ranges`), which
-      `stereokit.match_large` then looks for first;
+    - ``needs_ranges``: its costs depend on the smallest and largest values of the whole images (`CostInput.ranges`),
+      which `stereokit.match_large` then looks for first;
     - ``bytes_per_pixel``: memory that it takes beside its buffers.
     """
 
@@ -125,10 +123,10 @@ class Cost(Protocol):
         """Steps of cost per unit in which users give penalties."""
 
     @property
-    def dear(self) -> bool:
+    def costly_to_recompute(self) -> bool:
         """Whether a row costs more to compute again than to bring back from a volume."""
 
-    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[Any]:
+    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[Any]:
         """Prepare an image pair; return a row producer, a named tuple, for each of `workers` sweeps."""
 
 
@@ -137,84 +135,86 @@ def takes_8_bits(cost: Any) -> bool:
     return bool(getattr(cost, "eight_bits", False))
 
 
-class Cells(NamedTuple):
-    """Which cells of a row of costs have no evidence (flat arrays, for kernels)."""
+class CellMask(NamedTuple):
+    """Cells of a row of costs that have no evidence (flat arrays, for kernels)."""
 
     width: int
     blocks: tuple[int, ...]  # one element per 64 levels: its length is known to the compiler
     padded: int
     minimum: int
-    outside: np.uint8  # cost of a cell without evidence
-    low: NDArray[np.uint8]  # per element of the reversed right row: bounds that the cost is held to,
-    high: NDArray[np.uint8]  # 0 and 255 where there is evidence, `outside` twice where there is none
+    border_cost: np.uint8  # of a cell without evidence
+    low: NDArray[np.uint8]  # per element of the reversed right row: bounds to which the cost is clamped,
+    high: NDArray[np.uint8]  # 0 and 255 where there is evidence, `border_cost` twice where there is none
     stride: int  # from one row of low and high to the next; 0 when all rows share one
     left_bad: NDArray[np.uint8]  # (H * W), or empty when every pixel is valid
     padding: NDArray[np.uint8]  # (P): 0 for levels that exist, 255 for those that pad
 
 
-def cost_row(rows: Any, y: int, out: Any) -> None:
+_PRODUCERS: dict[type, Callable[..., None]] = {}
+"""The compiled function that writes a row, by the named tuple of its producer."""
+
+
+@by_types
+def cost_row(rows: Any, y: Any, out: Any) -> Any:
     """Write the costs of image row `y` into the flat ``uint8`` array `out` (``W * P``); compiled code only."""
-    raise NotImplementedError("cost_row can be called from compiled code only")
+    function = _PRODUCERS[rows.instance_class]
+    return lambda rows, y, out: function(rows, y, out)
 
 
 def implements(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that makes a compiled function the `cost_row` of the named tuple `kind`."""
 
-    def add(function: Callable[..., None]) -> Callable[..., None]:
-        def choose(rows: Any, y: Any, out: Any) -> Any:
-            if isinstance(rows, types.BaseNamedTuple) and rows.instance_class is kind:
-                return lambda rows, y, out: function(rows, y, out)
-            return None
-
-        overload(cost_row, strict=False)(choose)
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        _PRODUCERS[kind] = function
         return function
 
-    return add
+    return register
 
 
-def cells_of(pair: Pair, cost_max: int, workspace: Workspace) -> Cells:
-    """Return the evidence of `pair` for a cost whose range is ``0..cost_max``; that of whole images is kept."""
+def cell_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
+    """Return the cells of `pair` without evidence, for costs of ``0..cost_max``; cached where no pixel is invalid."""
     if pair.left_bad is not None or pair.right_bad is not None:
-        return _new_cells(pair, cost_max, Workspace())
-    key = pair.left.shape, pair.levels, pair.outside, cost_max
-    return workspace.once("cells", key, lambda: _new_cells(pair, cost_max, Workspace()))
+        return _new_mask(pair, cost_max, Workspace())
+    key = pair.left.shape, pair.levels, pair.border_share, cost_max
+    return workspace.cached("cells", key, lambda: _new_mask(pair, cost_max, Workspace()))
 
 
-def _new_cells(pair: Pair, cost_max: int, workspace: Workspace) -> Cells:
+def _new_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
     height, width = pair.left.shape
     levels = pair.levels
-    outside = np.uint8(cost_max if pair.outside is None else round(pair.outside * cost_max))
+    border_cost = np.uint8(cost_max if pair.border_share is None else round(pair.border_share * cost_max))
     stride = width + levels.padded
     shared = pair.right_bad is None
     low = workspace.array("cells.low", (1 if shared else height, stride), np.uint8)
     high = workspace.array("cells.high", low.shape, np.uint8)
     columns = width - 1 - levels.minimum - np.arange(stride)
     inside = (columns >= 0) & (columns < width)
-    evidence = np.broadcast_to(inside | (pair.outside is None), low.shape)
+    evidence = np.broadcast_to(inside | (pair.border_share is None), low.shape)
     if pair.right_bad is not None:
         evidence = evidence & ~pair.right_bad[:, np.clip(columns, 0, width - 1)]
-    low[...] = np.where(evidence, 0, outside)
-    high[...] = np.where(evidence, 255, outside)
+    low[...] = np.where(evidence, 0, border_cost)
+    high[...] = np.where(evidence, 255, border_cost)
     left_bad = np.empty(0, np.uint8) if pair.left_bad is None else pair.left_bad.view(np.uint8).ravel()
     padding = workspace.array("cells.padding", levels.padded, np.uint8)
     padding[: levels.count] = 0
     padding[levels.count :] = WORST
-    return Cells(
-        width,
-        tuple(range(levels.padded // LANES)),
-        levels.padded,
-        levels.minimum,
-        outside,
-        low.ravel(),
-        high.ravel(),
-        0 if shared else stride,
-        left_bad,
-        padding,
+    return CellMask(
+        width=width,
+        blocks=tuple(range(levels.padded // LANES)),
+        padded=levels.padded,
+        minimum=levels.minimum,
+        border_cost=border_cost,
+        low=low.ravel(),
+        high=high.ravel(),
+        stride=0 if shared else stride,
+        left_bad=left_bad,
+        padding=padding,
     )
 
 
 @inline
-def _hold(cells: Cells, y: int, x: int, out: NDArray[np.uint8]) -> None:
+def _clamp_cells(cells: CellMask, y: int, x: int, out: NDArray[np.uint8]) -> None:
+    """Clamp the costs of pixel x of row y to the bounds of their right pixels."""
     right = y * cells.stride + cells.width - 1 - x
     for block in range(0, cells.padded, LANES):
         cost = load(out, x * cells.padded + block)
@@ -223,26 +223,26 @@ def _hold(cells: Cells, y: int, x: int, out: NDArray[np.uint8]) -> None:
 
 
 @kernel
-def close_row(cells: Cells, y: int, out: NDArray[np.uint8]) -> None:
-    """Give the cells of row `y` without evidence their cost, and the padding levels theirs."""
+def mask_row(cells: CellMask, y: int, out: NDArray[np.uint8]) -> None:
+    """Set the cells of row `y` without evidence to the border's cost, and the levels that pad to the worst."""
     if cells.stride > 0:
         for x in range(cells.width):
-            _hold(cells, y, x, out)
+            _clamp_cells(cells, y, x, out)
     else:
         for x in range(min(cells.width, max(0, cells.padded - 1 + cells.minimum))):
-            _hold(cells, y, x, out)
+            _clamp_cells(cells, y, x, out)
         for x in range(max(0, cells.width + min(cells.minimum, 0)), cells.width):
-            _hold(cells, y, x, out)
+            _clamp_cells(cells, y, x, out)
     if cells.left_bad.size > 0:
         for x in range(cells.width):
             if cells.left_bad[y * cells.width + x] != 0:
                 for block in range(0, cells.padded, LANES):
-                    store(out, x * cells.padded + block, splat(cells.outside))
+                    store(out, x * cells.padded + block, splat(cells.border_cost))
     if cells.padding[cells.padded - 1] != 0:
         last = cells.padded - LANES
         padding = load(cells.padding, last)
         for x in range(cells.width):
-            store(out, x * cells.padded + last, either(load(out, x * cells.padded + last), padding))
+            store(out, x * cells.padded + last, bitwise_or(load(out, x * cells.padded + last), padding))
 
 
 @kernel
@@ -260,7 +260,7 @@ def _pad(image: NDArray[Any], y0: int, y1: int, margin: int, reversed_from: int,
                 target[k] = source[min(max(k - margin, 0), width - 1)]
 
 
-def pad_pair(pair: Pair, margin: int, workspace: Workspace) -> tuple[NDArray[Any], NDArray[Any]]:
+def pad_pair(pair: CostInput, margin: int, workspace: Workspace) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the left image with clamped borders, and the right one reversed with clamped borders.
 
     Returns
@@ -300,7 +300,7 @@ def _produce(rows: Any, y0: int, y1: int, out: NDArray[np.uint8]) -> None:
 
 
 class VolumeRows(NamedTuple):
-    """Rows of a cost volume that is already there: ``(H, W, D)`` ``uint8``, not padded."""
+    """Rows of a cost volume in memory: ``(H, W, D)`` ``uint8``, not padded."""
 
     volume: NDArray[np.uint8]
     padded: int

@@ -1,4 +1,4 @@
-"""What the CUDA twins of the costs share: the layout of the volume, and which cells have no evidence.
+"""Common parts of the costs' CUDA twins: the layout of the volume, and the cells without evidence.
 
 A volume holds four levels to a 32-bit word, ``padded / 4`` words to a pixel: byte b of word w is level ``4 * w + b``.
 Levels that only pad hold 255. A thread computes one word of each pixel of a strip of a row: the right pixels of its
@@ -17,7 +17,7 @@ from stereokit.costs.rows import Levels
 from stereokit.cuda.kernel import array, device, i32, u8, u32
 from stereokit.images.prepare_cuda import clamped
 
-__all__ = ["EVIDENCE", "Scene", "held", "masked_cost", "pad_levels", "padding"]
+__all__ = ["EVIDENCE", "DevicePair", "apply_border", "masked_cost", "pad_levels", "padding"]
 
 
 def pad_levels(count: int) -> int:
@@ -29,7 +29,7 @@ def pad_levels(count: int) -> int:
 
 
 @dataclass(frozen=True)
-class Scene:
+class DevicePair:
     """A grey pair on the device, ready for a cost.
 
     Attributes
@@ -46,7 +46,7 @@ class Scene:
         Size of an image, pixels.
     levels : Levels
         Disparities to try.
-    outside : float or None
+    border_share : float or None
     ranges : ((int, int), (int, int)) or None
         As of `stereokit.costs.rows.Pair`.
     """
@@ -58,7 +58,7 @@ class Scene:
     height: int
     width: int
     levels: Levels
-    outside: float | None
+    border_share: float | None
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
     @property
@@ -73,33 +73,33 @@ class Scene:
 
     def evidence(self, cost_max: int) -> tuple[Any, ...]:
         """Return the last arguments of a cost's kernel, of the types `EVIDENCE`."""
-        outside = cost_max if self.outside is None else round(self.outside * cost_max)
-        beyond = int(self.outside is None)
+        border_cost = cost_max if self.border_share is None else round(self.border_share * cost_max)
+        clamp_border = int(self.border_share is None)
         size = self.height, self.width, self.padded // 4
-        return self.bad, *size, self.levels.count, self.levels.minimum, outside, beyond
+        return self.bad, *size, self.levels.count, self.levels.minimum, border_cost, clamp_border
 
 
 EVIDENCE = (array(u8), i32, i32, i32, i32, i32, i32, i32)
-"""Types of `bad`, height, width, words of a pixel, levels, lowest disparity, cost without evidence and `beyond`."""
+"""Types of `bad`, height, width, words of a pixel, levels, lowest disparity, `border_cost` and `clamp_border`."""
 
 
 @device
 def padding(level, count):  # type: ignore[no-untyped-def]
-    """Return what the padding levels of the word that begins with `level` hold: 255 each."""
+    """Return the padding levels of the word that begins with `level`: 255 each."""
     existing = i32(min(max(i32(count - level), i32(0)), i32(4)))
     return u32(0) if existing == 4 else u32(u32(0xFFFFFFFF) << u32(u32(8) * u32(existing)))
 
 
 @device
-def held(cost, column, width, outside, beyond):  # type: ignore[no-untyped-def]
-    """Return the cost of a cell whose right pixel lies in `column`, or what it is outside the image."""
-    return i32(cost) if beyond != 0 or u32(column) < u32(width) else i32(outside)
+def apply_border(cost, column, width, border_cost, clamp_border):  # type: ignore[no-untyped-def]
+    """Return the cost of a cell whose right pixel lies in `column`: `border_cost` outside the image, unless clamped."""
+    return i32(cost) if clamp_border != 0 or u32(column) < u32(width) else i32(border_cost)
 
 
 @device
-def masked_cost(cost, column, y, x, bad, height, width, outside):  # type: ignore[no-untyped-def]
+def masked_cost(cost, column, y, x, bad, height, width, border_cost):  # type: ignore[no-untyped-def]
     """Return the cost of a cell, or what it is where one of its two pixels is bad."""
     right = u32(u32(height + y) * u32(width) + u32(clamped(column, width - 1)))
     if bad[u32(u32(y) * u32(width) + u32(x))] != 0 or bad[right] != 0:
-        return i32(outside)
+        return i32(border_cost)
     return i32(cost)

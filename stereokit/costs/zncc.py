@@ -32,7 +32,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Cells, Pair, cells_of, close_row, implements
+from stereokit.costs.rows import CellMask, CostInput, cell_mask, implements, mask_row
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer
 from stereokit.kernels.jit import by_types, inline, kernel
@@ -57,26 +57,44 @@ from stereokit.registry import COSTS
 __all__ = ["Zncc"]
 
 
-class ZnccRows(NamedTuple):
-    """Padded images, window statistics and the running sums of one worker, for `cost_row`."""
+class Images(NamedTuple):
+    """Padded images, grey values centred and brought into range; flat."""
 
-    cells: Cells
-    half: int  # half the window
-    left: NDArray[np.int16]  # padded image, element (y + half) * left_stride + half + x
+    left: NDArray[np.int16]  # element (y + half) * left_stride + half + x
     left_stride: int
-    right: NDArray[np.int16]  # padded and reversed, element (y + half) * right_stride + half + k
+    right: NDArray[np.int16]  # reversed, element (y + half) * right_stride + half + k
     right_stride: int
-    left_sum: NDArray[np.int32]  # sum over the window, negative, in the low half; element y * W + x
+
+
+class Statistics(NamedTuple):
+    """Sums over windows and reciprocal roots of their variances; flat."""
+
+    left_sum: NDArray[np.int32]  # negative, in the low half; element y * W + x
     left_scale: NDArray[np.float32]  # steps / sqrt(variance), 0 where there is none
     right_sum: NDArray[np.int32]  # element y * right_width + k
     right_scale: NDArray[np.float32]  # 1 / sqrt(variance), 0 where there is none
     right_width: int
-    steps: int
-    large: tuple[int, ...]  # not empty when steps do not fit a signed byte; known to the compiler
+
+
+class ColumnSums(NamedTuple):
+    """Sums of products over the columns of the windows around one row, which slide with it; of one worker."""
+
+    row: NDArray[np.int64]  # (1,): that row, or -1
+    sums: NDArray[np.int32]  # n times the sums, element ((d // 64) * C + half + x) * 64 + d % 64
     factors: NDArray[np.int32]  # n * left pixels of the row that comes (low half), -n * those of the one that goes
     pairs: NDArray[np.int32]  # right pixels of the row that comes (low half) and of the one that goes (high half)
-    sums: NDArray[np.int32]  # n times the column sums around row `at`, element ((d // 64) * C + half + x) * 64 + d % 64
-    at: NDArray[np.int64]  # (1,): the row whose column sums are held, or -1
+
+
+class ZnccRows(NamedTuple):
+    """Padded images, window statistics and the column sums of one worker, for `cost_row`."""
+
+    cells: CellMask
+    half: int  # half the window
+    images: Images
+    statistics: Statistics
+    columns: ColumnSums
+    steps: int
+    wide_steps: tuple[int, ...]  # not empty when steps do not fit a signed byte; known to the compiler
 
 
 @COSTS.register("zncc")
@@ -112,6 +130,11 @@ class Zncc:
         return self.steps
 
     @property
+    def reach(self) -> tuple[int, int]:
+        """Half of the window across and down, pixels."""
+        return self.window // 2, self.window // 2
+
+    @property
     def unit(self) -> int:
         """Penalties are given on the scale of C = min(1 - rho, 1), which `steps` units of cost make up."""
         return self.steps
@@ -122,11 +145,11 @@ class Zncc:
         return 2 * ((2**15 - 1) // (self.window * self.window))
 
     @property
-    def dear(self) -> bool:
+    def costly_to_recompute(self) -> bool:
         """Whether a row costs more to compute again than to bring back from a volume."""
         return True
 
-    def prepare(self, pair: Pair, workspace: Workspace, workers: int) -> list[ZnccRows]:
+    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[ZnccRows]:
         """Compute the window statistics; return the row producers of `workers` sweeps."""
         half = self.window // 2
         height, width = pair.left.shape
@@ -141,22 +164,22 @@ class Zncc:
         right_sum = workspace.array("zncc.right_sum", (height, right_width), np.int32)
         right_scale = workspace.array("zncc.right_scale", (height, right_width), np.float32)
         scales: dict[bool, tuple[int, np.float32]] = {}
-        images = {True: pair.left, False: pair.right}
+        grey = {True: pair.left, False: pair.right}
 
         def measure(of_left: bool) -> None:
-            image = images[of_left]
+            image = grey[of_left]
             if pair.ranges is None:
                 low, high = int(image.min()), int(image.max())
             else:  # smoothing at the side of a window may leave the range
                 low, high = pair.ranges[0 if of_left else 1]
-                images[of_left] = np.clip(image, low, high)
+                grey[of_left] = np.clip(image, low, high)
             scales[of_left] = self._scale(low, high)
 
         def centre(y0: int, y1: int, of_left: bool) -> None:
             if of_left:
-                _centre(images[True], y0, y1, half, 1, -half, *scales[True], left)
+                _centre(grey[True], y0, y1, half, 1, -half, *scales[True], left)
             else:
-                _centre(images[False], y0, y1, half, -1, start, *scales[False], right)
+                _centre(grey[False], y0, y1, half, -1, start, *scales[False], right)
 
         def summarise(k: int, y0: int, y1: int) -> None:
             work = workspace.array(f"zncc.work{k}", (4, right_width + 2 * half), np.int32)
@@ -169,30 +192,33 @@ class Zncc:
             [partial(summarise, k, y0, y1) for k, (y0, y1) in enumerate(spans(height, pair.threads))],
         ]
         run_stages(stages, pair.threads)
-        cells = cells_of(pair, self.cost_max, workspace)
+        cells = cell_mask(pair, self.cost_max, workspace)
+        images = Images(left=left.ravel(), left_stride=left.shape[1], right=right.ravel(), right_stride=right.shape[1])
+        statistics = Statistics(
+            left_sum=left_sum.ravel(),
+            left_scale=left_scale.ravel(),
+            right_sum=right_sum.ravel(),
+            right_scale=right_scale.ravel(),
+            right_width=right_width,
+        )
         producers = []
         for worker in range(workers):
-            at = workspace.array(f"zncc.at{worker}", 1, np.int64)
-            at[0] = -1
+            columns = ColumnSums(
+                row=workspace.array(f"zncc.row{worker}", 1, np.int64),
+                sums=workspace.array(f"zncc.sums{worker}", (width + 2 * half) * padded, np.int32),
+                factors=workspace.array(f"zncc.factors{worker}", width + 2 * half, np.int32),
+                pairs=workspace.array(f"zncc.pairs{worker}", right_width + 2 * half, np.int32),
+            )
+            columns.row[0] = -1
             producers.append(
                 ZnccRows(
-                    cells,
-                    half,
-                    left.ravel(),
-                    left.shape[1],
-                    right.ravel(),
-                    right.shape[1],
-                    left_sum.ravel(),
-                    left_scale.ravel(),
-                    right_sum.ravel(),
-                    right_scale.ravel(),
-                    right_width,
-                    self.steps,
-                    (0,) if self.steps > 127 else (),
-                    workspace.array(f"zncc.factors{worker}", width + 2 * half, np.int32),
-                    workspace.array(f"zncc.pairs{worker}", right_width + 2 * half, np.int32),
-                    workspace.array(f"zncc.sums{worker}", (width + 2 * half) * padded, np.int32),
-                    at,
+                    cells=cells,
+                    half=half,
+                    images=images,
+                    statistics=statistics,
+                    columns=columns,
+                    steps=self.steps,
+                    wide_steps=(0,) if self.steps > 127 else (),
                 )
             )
         return producers
@@ -238,7 +264,7 @@ def _statistics(
     image: NDArray[np.int16], y0: int, y1: int, window: int, scale: int, left: bool, work: NDArray[np.int32],
     out_sum: NDArray[np.int32], out_scale: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Window sums and scale / sqrt(variance) of rows y0..y1 of a padded image; sums as the `left` ones are kept."""
+    """Window sums and scale / sqrt(variance) of rows y0..y1 of a padded image; sums in the form of the `left` ones."""
     width = out_sum.shape[1]
     sums = work[0, : width + window - 1]
     squares = work[1, : width + window - 1]
@@ -277,38 +303,38 @@ def _statistics(
 @inline
 def _pair_rows(rows: ZnccRows, row_in: int, row_out: int) -> None:
     """Fill `pairs` and `factors` for a row of the padded images that comes and one that goes; -1 is none."""
-    new = max(row_in, 0) * rows.right_stride
-    old = max(row_out, 0) * rows.right_stride
-    for k in range(rows.pairs.size):
-        low = np.int32(rows.right[new + k]) & np.int32(0xFFFF)
-        high = np.int32(np.int32(rows.right[old + k]) << np.int32(16))
-        rows.pairs[k] = np.int32(low | high)
-    new = max(row_in, 0) * rows.left_stride
-    old = max(row_out, 0) * rows.left_stride
+    new = max(row_in, 0) * rows.images.right_stride
+    old = max(row_out, 0) * rows.images.right_stride
+    for k in range(rows.columns.pairs.size):
+        low = np.int32(rows.images.right[new + k]) & np.int32(0xFFFF)
+        high = np.int32(np.int32(rows.images.right[old + k]) << np.int32(16))
+        rows.columns.pairs[k] = np.int32(low | high)
+    new = max(row_in, 0) * rows.images.left_stride
+    old = max(row_out, 0) * rows.images.left_stride
     n = np.int32((2 * rows.half + 1) ** 2)
     n_in = n if row_in >= 0 else np.int32(0)
     n_out = np.int32(-n) if row_out >= 0 else np.int32(0)
-    for c in range(rows.factors.size):
-        low = np.int32(n_in * np.int32(rows.left[new + c])) & np.int32(0xFFFF)
-        high = np.int32(np.int32(n_out * np.int32(rows.left[old + c])) << np.int32(16))
-        rows.factors[c] = np.int32(low | high)
+    for c in range(rows.columns.factors.size):
+        low = np.int32(n_in * np.int32(rows.images.left[new + c])) & np.int32(0xFFFF)
+        high = np.int32(np.int32(n_out * np.int32(rows.images.left[old + c])) << np.int32(16))
+        rows.columns.factors[c] = np.int32(low | high)
 
 
 @inline
 def _column(rows: ZnccRows, at: int, c: int, block: int) -> Any:
     """Bring the sums of padded column `c`, at element `at`, to the row that `pairs` and `factors` lead to."""
-    theirs = load(rows.pairs, rows.factors.size - 1 - c + block)
-    column = add(load(rows.sums, at), multiply_pairs(theirs, splat_at(rows.factors, c)))
-    store(rows.sums, at, column)
+    right = load(rows.columns.pairs, rows.columns.factors.size - 1 - c + block)
+    column = add(load(rows.columns.sums, at), multiply_pairs(right, splat_at(rows.columns.factors, c)))
+    store(rows.columns.sums, at, column)
     return column
 
 
 @inline
 def _start_sums(rows: ZnccRows, y: int) -> None:
     """Fill the column sums with all rows of the window around row `y` but the last."""
-    columns = rows.factors.size
-    for at in range(0, rows.sums.size, LANES):
-        store(rows.sums, at, splat(np.int32(0)))
+    columns = rows.columns.factors.size
+    for at in range(0, rows.columns.sums.size, LANES):
+        store(rows.columns.sums, at, splat(np.int32(0)))
     for row in range(y, y + 2 * rows.half):
         _pair_rows(rows, row, -1)
         for n in range(len(rows.cells.blocks)):
@@ -317,20 +343,20 @@ def _start_sums(rows: ZnccRows, y: int) -> None:
 
 
 @by_types
-def _to_costs(rho: Any, steps: Any, large: Any) -> Any:
+def _to_costs(rho: Any, steps: Any, wide: Any) -> Any:
     """Return ``steps - max(round(rho), 0)`` as bytes; compiled code only."""
     # Adding this leaves the float's last bits no fraction: they hold the nearest integer, ties to even.
     magic = np.float32(1.5 * 2**23)
 
-    def of_bytes(rho: Any, steps: Any, large: Any) -> Any:
+    def of_bytes(rho: Any, steps: Any, wide: Any) -> Any:
         whole = convert(bits_of(add(rho, splat(magic))), np.int8(0))
         return subtract(splat(np.uint8(steps)), convert(maximum(whole, splat(np.int8(0))), np.uint8(0)))
 
-    def of_words(rho: Any, steps: Any, large: Any) -> Any:
+    def of_words(rho: Any, steps: Any, wide: Any) -> Any:
         whole = convert(bits_of(add(rho, splat(magic))), np.int16(0))
         return subtract(splat(np.uint8(steps)), convert(maximum(whole, splat(np.int16(0))), np.uint8(0)))
 
-    return of_words if len(large) > 0 else of_bytes
+    return of_words if len(wide) > 0 else of_bytes
 
 
 @implements(ZnccRows)
@@ -338,7 +364,7 @@ def _to_costs(rho: Any, steps: Any, large: Any) -> Any:
 def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
     cells = rows.cells
     window = 2 * rows.half + 1
-    last = rows.at[0]
+    last = rows.columns.row[0]
     row_in = np.int64(-1)  # of the padded image: row y of it is the top of the window around row y
     row_out = np.int64(-1)
     if last >= 0 and y == last + 1:
@@ -350,7 +376,7 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
     elif y != last:
         _start_sums(rows, y)
         row_in = y + window - 1
-    rows.at[0] = y
+    rows.columns.row[0] = y
     _pair_rows(rows, row_in, row_out)
     padded = LANES * len(cells.blocks)
     columns = cells.width + window - 1
@@ -364,11 +390,11 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
         for x in range(cells.width):
             at = base + x * LANES  # of the oldest column
             total = add(total, _column(rows, at + (window - 1) * LANES, x + window - 1, block))
-            k = y * rows.right_width + cells.width - 1 - x + block
-            mine = splat_at(rows.left_sum, y * cells.width + x)
-            numerator = add(total, multiply_pairs(load(rows.right_sum, k), mine))
-            rho = multiply(convert(numerator, np.float32(0)), load(rows.right_scale, k))
-            rho = multiply(rho, splat_at(rows.left_scale, y * cells.width + x))
-            store(out, x * padded + block, _to_costs(rho, rows.steps, rows.large))
-            total = subtract(total, load(rows.sums, at))
-    close_row(cells, y, out)
+            k = y * rows.statistics.right_width + cells.width - 1 - x + block
+            left_sum = splat_at(rows.statistics.left_sum, y * cells.width + x)
+            numerator = add(total, multiply_pairs(load(rows.statistics.right_sum, k), left_sum))
+            rho = multiply(convert(numerator, np.float32(0)), load(rows.statistics.right_scale, k))
+            rho = multiply(rho, splat_at(rows.statistics.left_scale, y * cells.width + x))
+            store(out, x * padded + block, _to_costs(rho, rows.steps, rows.wide_steps))
+            total = subtract(total, load(rows.columns.sums, at))
+    mask_row(cells, y, out)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.costs.rows_cuda import EVIDENCE, Scene, held, masked_cost, padding
+from stereokit.costs.rows_cuda import EVIDENCE, DevicePair, apply_border, masked_cost, padding
 from stereokit.costs.zncc import Zncc
 from stereokit.cuda.kernel import Kernel, Queue, array, blocks_for, cuda, f32, i16, i32, kernel, u32
 from stereokit.errors import DeviceError
@@ -61,8 +61,8 @@ def centre_kernel(dtype: np.dtype[Any]) -> Kernel:
             value = f32(f32(i32(pixel - middle)) * factor)
             out[at] = i16(cuda.libdevice.float2int_rn(value))
 
-    made: Kernel = zncc_centre
-    return made
+    result: Kernel = zncc_centre
+    return result
 
 
 @kernel(array(i16), i32, i32, i32, i32, array(i32), array(f32), block=128)
@@ -105,7 +105,7 @@ def costs_kernel(window: int, masked: bool) -> Kernel:
     @kernel(*images, *images, i32, array(u32), *EVIDENCE, block=128, name=name)
     def zncc_costs(  # type: ignore[no-untyped-def]
         left, left_sum, left_scale, right, right_sum, right_scale, steps, volume,
-        bad, height, width, span, count, minimum, outside, beyond,
+        bad, height, width, span, count, minimum, border_cost, clamp_border,
     ):  # fmt: skip
         at = u32(cuda.grid(1))
         strips = u32(u32(width + i32(STRIP - 1)) // u32(STRIP))
@@ -151,9 +151,9 @@ def costs_kernel(window: int, masked: bool) -> Kernel:
                         pixels[4 * j + 3 - k] = pixels[4 * j + 2 - k]
                     there = u32(right_row + u32(u32(j) * u32(reach + u32(window - 1))) + u32(step))
                     pixels[4 * j] = i32(right[there])
-                    mine = i32(left[u32(left_row + u32(u32(j) * u32(width + i32(window - 1))) + u32(step))])
+                    left_pixel = i32(left[u32(left_row + u32(u32(j) * u32(width + i32(window - 1))) + u32(step))])
                     for k in range(4):
-                        gain = i32(mine * pixels[4 * j + k])
+                        gain = i32(left_pixel * pixels[4 * j + k])
                         columns[newest + k] = i32(columns[newest + k] + gain)
                 for k in range(4):
                     totals[k] = i32(totals[k] + columns[newest + k])
@@ -166,22 +166,22 @@ def costs_kernel(window: int, masked: bool) -> Kernel:
                         scales[3 - k] = scales[2 - k]
                     sums[0] = right_sum[there]
                     scales[0] = right_scale[there]
-                    mine = left_sum[pixel]
+                    window_sum = left_sum[pixel]
                     scale = left_scale[pixel]
                     packed = pads
                     for k in range(4):
-                        numerator = i32(i32(i32(window * window) * totals[k]) - i32(mine * sums[k]))
+                        numerator = i32(i32(i32(window * window) * totals[k]) - i32(window_sum * sums[k]))
                         rho = f32(f32(f32(numerator) * scales[k]) * scale)
                         cost = i32(steps - max(i32(cuda.libdevice.float2int_rn(rho)), i32(0)))
                         column = i32(x - level - i32(k) - minimum)
-                        cost = held(cost, column, width, outside, beyond)
+                        cost = apply_border(cost, column, width, border_cost, clamp_border)
                         if masked:
-                            cost = masked_cost(cost, column, y, x, bad, height, width, outside)
+                            cost = masked_cost(cost, column, y, x, bad, height, width, border_cost)
                         packed = u32(packed | u32(u32(cost) << u32(8 * k)))
                     volume[u32(u32(pixel * u32(span)) + word)] = packed
 
-    made: Kernel = zncc_costs
-    return made
+    result: Kernel = zncc_costs
+    return result
 
 
 for _dtype in KINDS:
@@ -192,18 +192,18 @@ for _window in range(3, LARGEST_WINDOW + 1, 2):
 
 
 def statistics(
-    queue: Queue, cost: Zncc, scene: Scene, extremes: Any, place: int, first: int, columns: int, scale: int
+    queue: Queue, cost: Zncc, pair: DevicePair, extremes: Any, place: int, first: int, columns: int, scale: int
 ) -> tuple[Any, Any, Any]:
     """Return a centred image with its borders, the window sums of its pixels, and ``scale / sqrt(variance)``."""
-    height, width, half = scene.height, scene.width, cost.window // 2
+    height, width, half = pair.height, pair.width, cost.window // 2
     side = ("left", "right")[place]
     size = (height + 2 * half) * (columns + 2 * half)
     image = queue.array(f"zncc.{side}", size, np.int16)
     sums = queue.array(f"zncc.{side}_sum", height * columns, np.int32)
     scales = queue.array(f"zncc.{side}_scale", height * columns, np.float32)
-    made = centre_kernel(scene.dtype)
+    centre = centre_kernel(pair.dtype)
     shape = half, first, columns, height, width
-    queue.launch(made, blocks_for(size, made.block), scene.images, place, extremes, cost.range_max, *shape, image)
+    queue.launch(centre, blocks_for(size, centre.block), pair.images, place, extremes, cost.range_max, *shape, image)
     blocks = blocks_for(height * math.ceil(columns / _PART), zncc_statistics.block)
     queue.launch(zncc_statistics, blocks, image, cost.window, scale, columns, height, sums, scales)
     return image, sums, scales
@@ -215,7 +215,7 @@ def check(cost: Zncc) -> None:
         raise DeviceError(f"window of zncc must be at most {LARGEST_WINDOW} on device 'cuda', got {cost.window}")
 
 
-def volume(queue: Queue, cost: Zncc, scene: Scene) -> Any:
+def volume(queue: Queue, cost: Zncc, pair: DevicePair) -> Any:
     """Return the volume of costs of a pair, flat words on the device (`stereokit.costs.rows_cuda`).
 
     Raises
@@ -224,17 +224,17 @@ def volume(queue: Queue, cost: Zncc, scene: Scene) -> Any:
         If the window is larger than `LARGEST_WINDOW`.
     """
     check(cost)
-    height, width = scene.height, scene.width
-    if scene.ranges is None:
-        extremes = ranges(queue, scene.images, scene.dtype, height * width)
+    height, width = pair.height, pair.width
+    if pair.ranges is None:
+        extremes = ranges(queue, pair.images, pair.dtype, height * width)
     else:
-        extremes = queue.upload("zncc.ranges", np.array(scene.ranges, np.int32))
-    first = -scene.levels.minimum - (scene.padded - 1)
-    left = statistics(queue, cost, scene, extremes, 0, 0, width, cost.steps)
-    right = statistics(queue, cost, scene, extremes, 1, first, scene.reach, 1)
-    out = queue.array("costs", height * width * scene.padded // 4, np.uint32)
-    made = costs_kernel(cost.window, scene.masked)
-    threads = height * -(-width // STRIP) * scene.padded // 4
-    evidence = scene.evidence(cost.cost_max)
-    queue.launch(made, blocks_for(threads, made.block), *left, *right, cost.steps, out, *evidence)
+        extremes = queue.upload("zncc.ranges", np.array(pair.ranges, np.int32))
+    first = -pair.levels.minimum - (pair.padded - 1)
+    left = statistics(queue, cost, pair, extremes, 0, 0, width, cost.steps)
+    right = statistics(queue, cost, pair, extremes, 1, first, pair.reach, 1)
+    out = queue.array("costs", height * width * pair.padded // 4, np.uint32)
+    costs = costs_kernel(cost.window, pair.masked)
+    threads = height * -(-width // STRIP) * pair.padded // 4
+    evidence = pair.evidence(cost.cost_max)
+    queue.launch(costs, blocks_for(threads, costs.block), *left, *right, cost.steps, out, *evidence)
     return out

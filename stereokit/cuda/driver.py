@@ -32,7 +32,7 @@ def _driver() -> tuple[Any, str]:
 
 
 def missing() -> str:
-    """Return what is missing for ``device="cuda"``, in words, or an empty string."""
+    """Return the words that say what ``device="cuda"`` lacks here; empty if nothing."""
     library, reason = _driver()
     if library is None:
         return reason

@@ -56,21 +56,21 @@ class DryQueue:
         """Note a resident array with the size of `values`."""
         return self.array(name, values.size, values.dtype)
 
-    def once(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> SizedArray:
+    def cached(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> SizedArray:
         """Note a resident table."""
         return self.upload(name, make())
 
-    def view(self, held: SizedArray, dtype: Any) -> SizedArray:
+    def view(self, array: SizedArray, dtype: Any) -> SizedArray:
         """Return the same memory as another type."""
-        return SizedArray(held.nbytes // np.dtype(dtype).itemsize, dtype)
+        return SizedArray(array.nbytes // np.dtype(dtype).itemsize, dtype)
 
     def launch(self, what: Any, blocks: int, *arguments: Any) -> None:
         """Run nothing."""
 
-    def copy(self, held: SizedArray) -> SizedArray:
+    def copy(self, array: SizedArray) -> SizedArray:
         """Note an array that is the caller's."""
-        return SizedArray(held.size, held.dtype)
+        return SizedArray(array.size, array.dtype)
 
-    def fetch(self, held: SizedArray) -> np.ndarray[Any, Any]:
+    def fetch(self, array: SizedArray) -> np.ndarray[Any, Any]:
         """Return zeros."""
-        return np.zeros(held.size, held.dtype)
+        return np.zeros(array.size, array.dtype)

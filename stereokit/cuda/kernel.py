@@ -14,7 +14,7 @@ A kernel is a plain Python function with the types of its arguments::
 The decorator returns a `Kernel`, files it in `KERNELS` and compiles nothing: `Kernel.ptx` compiles without a driver,
 `Queue.launch` runs it. A family of kernels is a cached function that makes one (window or levels as a constant) with
 ``name="zncc_costs_5"``; the module makes the common ones at import, so that `KERNELS` has them all. Helpers are
-compiled with `device`; functions of the CPU made with `stereokit.kernels.jit.inline` can be called as they are.
+compiled with `device`; functions of the CPU compiled with `stereokit.kernels.jit.inline` can be called as they are.
 
 Rules that the kernels follow, because each was a trap once:
 
@@ -105,7 +105,7 @@ class Kernel:
     def ptx(self, capability: tuple[int, int] = (8, 7)) -> str:
         """Return the PTX of the kernel; needs no driver.
 
-        numba asks the present GPU what to compile helpers for, even while it compiles for another one; it is told.
+        numba compiles helpers for the GPU that is present, even within a kernel for another one, unless it is set here.
         """
         asked = _dispatcher.get_current_device
         _dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=capability)
@@ -150,12 +150,12 @@ def device(function: Callable[..., Any]) -> Any:
 
 
 def blocks_for(threads: int, block: int) -> int:
-    """Return how many blocks make up at least so many threads."""
+    """Return the number of blocks for at least so many threads."""
     return -(-threads // block)
 
 
 class Queue(Protocol):
-    """What the stages run on: a stream of a GPU with the buffers that stay there, or a stand-in for tests.
+    """A stream of a GPU with the buffers that stay there, or a stand-in for tests.
 
     Launches are in order and nobody waits for them; only `fetch` does.
     """
@@ -166,19 +166,19 @@ class Queue(Protocol):
     def upload(self, name: str, values: np.ndarray[Any, Any]) -> Any:
         """Return the resident flat array called `name` with a copy of `values` in it."""
 
-    def once(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> Any:
+    def cached(self, name: str, key: Any, make: Callable[[], np.ndarray[Any, Any]]) -> Any:
         """Return the resident copy of a table, uploaded when `key` is not that of the last call."""
 
-    def view(self, held: Any, dtype: Any) -> Any:
+    def view(self, array: Any, dtype: Any) -> Any:
         """Return the same memory as an array of another type."""
 
     def launch(self, what: Kernel, blocks: int, *arguments: Any) -> None:
         """Run a kernel with so many blocks; scalars are converted to its signature."""
 
-    def copy(self, held: Any) -> Any:
+    def copy(self, array: Any) -> Any:
         """Return a new array on the device with the same content."""
 
-    def fetch(self, held: Any) -> np.ndarray[Any, Any]:
+    def fetch(self, array: Any) -> np.ndarray[Any, Any]:
         """Wait for all launches and return a copy of an array."""
 
 
@@ -207,8 +207,8 @@ def shuffle_from(value, lane):  # type: ignore[no-untyped-def]
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any, lanes: int) -> Any:
-    held = context.make_array(kind)(context, builder, array)
-    element = builder.gep(held.data, [index])
+    content = context.make_array(kind)(context, builder, array)
+    element = builder.gep(content.data, [index])
     scalar = context.get_value_type(kind.dtype)
     return builder.bitcast(element, ir.VectorType(scalar, lanes).as_pointer()), ir.VectorType(scalar, lanes)
 
@@ -260,8 +260,8 @@ def load_relaxed(typingctx, array, index):  # type: ignore[no-untyped-def]
     """Return an element of a uint32 array that other threads change by atomics meanwhile; never from a stale cache."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        held = context.make_array(signature.args[0])(context, builder, arguments[0])
-        address = builder.ptrtoint(builder.gep(held.data, [arguments[1]]), ir.IntType(64))
+        content = context.make_array(signature.args[0])(context, builder, arguments[0])
+        address = builder.ptrtoint(builder.gep(content.data, [arguments[1]]), ir.IntType(64))
         kind = ir.FunctionType(ir.IntType(32), [ir.IntType(64)])
         return builder.asm(kind, "ld.relaxed.gpu.global.u32 $0, [$1];", "=r,l,~{memory}", [address], True)
 

@@ -16,19 +16,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereokit.costs.rows_cuda import Scene
+from stereokit.costs.rows_cuda import DevicePair
 from stereokit.cuda.dry import DryQueue
 from stereokit.cuda.kernel import KERNELS, Kernel, Queue, blocks_for, cuda
 from stereokit.cuda.stream import DeviceQueue, stream_of
 from stereokit.errors import DeviceError, InputError
+from stereokit.images.evidence import joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.prepare_cuda import flip, halve, smooth, take
+from stereokit.images.resize import reduced_mask
 from stereokit.kernels.workspace import Pool
 from stereokit.pipeline import refined
 from stereokit.postprocess.chain_cuda import post_process, raise_to
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
-from stereokit.selection.wta_cuda import Maps, doubt
+from stereokit.selection.wta_cuda import Maps, zero_invalid_confidence
 from stereokit.settings import Detail, MatchSettings
 
 __all__ = ["CudaPipeline", "DeviceDisparity", "all_kernels"]
@@ -64,7 +66,7 @@ class DeviceDisparity:
     candidates: Any = None
 
 
-class _Found(NamedTuple):
+class _DeviceMaps(NamedTuple):
     """Maps of a match on the device: resident and flat, the next match on the queue writes over them."""
 
     disparity: Any
@@ -86,28 +88,28 @@ def _from_device(name: str, image: Any) -> _Image:
     """Return an image of the caller on the device, without a copy."""
     if not hasattr(image, "__cuda_array_interface__"):
         raise InputError(f"left and right must both lie on the device or both on the host, but {name} does not")
-    held = cuda.as_cuda_array(image)
-    if held.dtype != np.uint8:
+    array = cuda.as_cuda_array(image)
+    if array.dtype != np.uint8:
         raise InputError(
-            f"{name} must be uint8 on the device, got {held.dtype}; images of the host may have other types"
+            f"{name} must be uint8 on the device, got {array.dtype}; images of the host may have other types"
         )
-    if not (held.ndim == 2 or (held.ndim == 3 and held.shape[2] == 3)) or 0 in held.shape:
-        raise InputError(f"{name} must be grey (H, W) or RGB (H, W, 3), got shape {tuple(held.shape)}")
-    if not held.is_c_contiguous():
-        raise InputError(f"{name} must be C-contiguous on the device, got strides {tuple(held.strides)}")
-    channels = 1 if held.ndim == 2 else 3
-    return _Image(held.reshape(held.size), held.dtype, channels, tuple(held.shape[:2]))
+    if not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)) or 0 in array.shape:
+        raise InputError(f"{name} must be grey (H, W) or RGB (H, W, 3), got shape {tuple(array.shape)}")
+    if not array.is_c_contiguous():
+        raise InputError(f"{name} must be C-contiguous on the device, got strides {tuple(array.strides)}")
+    channels = 1 if array.ndim == 2 else 3
+    return _Image(array.reshape(array.size), array.dtype, channels, tuple(array.shape[:2]))
 
 
-def _reshaped(held: Any, shape: tuple[int, ...]) -> Any:
+def _reshaped(array: Any, shape: tuple[int, ...]) -> Any:
     """Return a flat array of the device as one of this shape."""
-    return held.reshape(*shape)
+    return array.reshape(*shape)
 
 
-def _flat(held: Any) -> Any:
+def _flat(array: Any) -> Any:
     """Return an array of the device as a flat one of numba."""
-    held = cuda.as_cuda_array(held)
-    return held.reshape(held.size)
+    array = cuda.as_cuda_array(array)
+    return array.reshape(array.size)
 
 
 def new_queue(stream: Any) -> Any:
@@ -143,7 +145,7 @@ class CudaPipeline:
         return CudaPipeline(self.settings.replaced(**changes))
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
-        """Return how many bytes of buffers a pair takes on the device; see `stereokit.pipeline.Pipeline`."""
+        """Return the bytes of buffers that a pair takes on the device; see `stereokit.pipeline.Pipeline`."""
         queue = DryQueue()
         dtype = np.dtype(dtype)
         pixels = height * width
@@ -164,18 +166,26 @@ class CudaPipeline:
             dtype = pair.left.dtype
             images = queue.upload("images", np.stack([pair.left, pair.right]))
             guide = images[: height * width] if dtype == np.uint8 else queue.upload("guide", pair.guide)
-            bad = None
-            if pair.left_bad is not None or pair.right_bad is not None:
+            bad = excluded = None
+            left_bad = joined(pair.left_bad, pair.left_blank)
+            if left_bad is not None or pair.right_bad is not None:
                 none = np.zeros(shape, np.bool_)
-                masks = (none if mask is None else mask for mask in (pair.left_bad, pair.right_bad))
+                masks = (none if mask is None else mask for mask in (left_bad, pair.right_bad))
                 bad = queue.upload("bad", np.stack(list(masks)).view(np.uint8))
-            found, shape = self.run(queue, images, dtype, guide, bad, (height, width), pair.ranges)
-            disparity, valid = queue.fetch(found.disparity), queue.fetch(found.valid).view(np.bool_)
-            confidence = None if found.confidence is None else queue.fetch(found.confidence).reshape(shape)
+            if pair.left_blank is not None:  # has no cost of its own, but a value
+                excluded = queue.upload("excluded", (none if pair.left_bad is None else pair.left_bad).view(np.uint8))
+            maps, shape = self.run(queue, images, dtype, guide, bad, (height, width), pair.ranges, excluded)
+            disparity, valid = queue.fetch(maps.disparity), queue.fetch(maps.valid).view(np.bool_)
+            confidence = None if maps.confidence is None else queue.fetch(maps.confidence).reshape(shape)
             candidates = None
-            if found.candidates is not None:
-                candidates = queue.fetch(found.candidates).reshape(2, *shape)
-        return Disparity(disparity.reshape(shape), valid.reshape(shape), confidence, candidates=candidates)
+            if maps.candidates is not None:
+                candidates = queue.fetch(maps.candidates).reshape(2, *shape)
+        valid = valid.reshape(shape)
+        blank = reduced_mask(pair.left_blank, self.settings.step)
+        if blank is not None:
+            valid = valid & ~blank
+            confidence = None if confidence is None else np.where(blank, np.float32(0), confidence)
+        return Disparity(disparity.reshape(shape), valid, confidence, candidates=candidates)
 
     def match_on_device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
         """Match a pair that lies on the device, and wait for nothing.
@@ -185,7 +195,7 @@ class CudaPipeline:
         left, right : (H, W) or (H, W, 3) uint8, C-contiguous, with ``__cuda_array_interface__``
             Grey or RGB; not modified.
         stream : stream of numba, PyTorch or CuPy, int, or None
-            Where to run; None is the default stream, which waits for all others that are not made otherwise.
+            Stream of the launches; None is the default stream, which waits for all others but non-blocking ones.
 
         Raises
         ------
@@ -205,37 +215,37 @@ class CudaPipeline:
         shape = views[0].shape
         stream = cuda.default_stream() if stream is None else stream_of(stream)
         with self._queue(stream) as queue:
-            found = self._match_views(queue, views, False, stream)
+            maps = self._match_views(queue, views, False, stream)
             if not half:  # what refiners return is new
-                found = _Found(*(None if part is None else _reshaped(queue.copy(part), shape) for part in found))
+                maps = _DeviceMaps(*(None if part is None else _reshaped(queue.copy(part), shape) for part in maps))
             other = None
             if self.settings.right:
                 mirrored = _flat(self._match_views(queue, views[::-1], True, stream).disparity)
                 out = queue.copy(mirrored)
                 queue.launch(flip, blocks_for(out.size, flip.block), mirrored, out, *shape)
                 other = _reshaped(out, shape)
-        confidence = found.confidence if self.settings.confidence else None
-        return DeviceDisparity(found.disparity, found.valid, confidence, other)
+        confidence = maps.confidence if self.settings.confidence else None
+        return DeviceDisparity(maps.disparity, maps.valid, confidence, other)
 
-    def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _Found:
+    def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _DeviceMaps:
         """Match two images on the device, or what a camera behind a mirror sees of them; at half size, refine."""
         shape, dtype = views[0].shape, views[0].dtype
         pixels = shape[0] * shape[1]
         images = queue.array("images", 2 * pixels, dtype)
         for place, image in enumerate(views):
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
-        found, size = self.run(queue, images, dtype, images[:pixels], None, shape)
+        maps, size = self.run(queue, images, dtype, images[:pixels], None, shape)
         if self.settings.scale != 1:
-            disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in found[:3])
-            two = None if found.candidates is None else _reshaped(found.candidates, (2, *size))
+            disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in maps[:3])
+            two = None if maps.candidates is None else _reshaped(maps.candidates, (2, *size))
             coarse = DeviceDisparity(disparity, valid, sure, candidates=two)
-            full = _Found(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
+            full = _DeviceMaps(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
             if self.settings.floor is None:
                 return full
             raised = _flat(full.disparity)
             queue.launch(raise_to, blocks_for(pixels, raise_to.block), raised, self.settings.floor, pixels)
             return full._replace(disparity=_reshaped(raised, shape))
-        return found
+        return maps
 
     @contextmanager
     def _queue(self, stream: Any) -> Iterator[Any]:
@@ -246,26 +256,28 @@ class CudaPipeline:
 
     def run(
         self, queue: Queue, images: Any, dtype: np.dtype[Any], guide: Any, bad: Any, shape: Shape,
-        ranges: tuple[tuple[int, int], tuple[int, int]] | None = None,
-    ) -> tuple[_Found, Shape]:  # fmt: skip
+        ranges: tuple[tuple[int, int], tuple[int, int]] | None = None, excluded: Any = None,
+    ) -> tuple[_DeviceMaps, Shape]:  # fmt: skip
         """Run all stages on grey images that a queue holds; return the maps and their size.
 
         Parameters
         ----------
         queue : Queue
-            Where to run.
+            Queue of launches.
         images : (2 * H * W,) uint8 or uint16 on the device
             Left and right image.
         dtype : numpy dtype
             Their type.
         guide : (H * W,) uint8 on the device
-            What edges are taken from.
+            Image of the edges.
         bad : (2 * H * W,) uint8 on the device, or None
             Not 0 where a pixel has no evidence.
         shape : (int, int)
             Height and width, pixels, before halving.
         ranges : ((int, int), (int, int)) or None
             As of `stereokit.costs.rows.Pair`.
+        excluded : (H * W,) uint8 on the device, or None
+            Not 0 where a pixel of the left view gets no value; None is where it is `bad`.
         """
         settings, levels = self.settings, self.settings.matched_levels
         if settings.scale != 1:
@@ -273,16 +285,18 @@ class CudaPipeline:
             images = halve(queue, "half.images", images, dtype, 2, shape, False)
             if bad is not None:
                 bad = halve(queue, "half.bad", bad, np.dtype(np.uint8), 2, shape, True)
+            if excluded is not None:
+                excluded = halve(queue, "half.excluded", excluded, np.dtype(np.uint8), 1, shape, True)
             shape = (shape[0] + 1) // 2, (shape[1] + 1) // 2
         height, width = shape
         pixels = height * width
         if settings.smooth > 0:
             images, dtype = smooth(queue, images, dtype, settings.smooth, shape), np.dtype(np.uint16)
         masks = queue.array("no.bad", 1, np.uint8) if bad is None else bad
-        scene = Scene(images, dtype, masks, bad is not None, height, width, levels, settings.outside, ranges)
-        if pixels * scene.padded >= 2**34:
+        pair = DevicePair(images, dtype, masks, bad is not None, height, width, levels, settings.border_cost, ranges)
+        if pixels * pair.padded >= 2**34:
             raise DeviceError(
-                f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * scene.padded}"
+                f"levels of all pixels must be fewer than 2**34 on the device, got {pixels * pair.padded}"
             )
         confidence = queue.array("match.confidence", (0, 1, 3)[settings.detail] * pixels or 1, np.float32)
         maps = Maps(
@@ -295,28 +309,30 @@ class CudaPipeline:
             np.float32(settings.uniqueness / 100),
             int(settings.detail),
         )
-        self._aggregate(queue, scene, guide, maps)
+        self._aggregate(queue, pair, guide, maps)
         candidates = None
         if settings.detail >= Detail.CANDIDATES:
             confidence, candidates = confidence[:pixels], confidence[pixels:]
-        left_bad = None if bad is None else bad[:pixels]
-        chain = settings.post_processing(pixels)
-        disparity, valid = post_process(queue, maps.disparity, maps.cost, left_bad, chain, shape)
+        left_bad = excluded if excluded is not None or bad is None else bad[:pixels]
+        steps = settings.post_processing(pixels)
+        disparity, valid = post_process(queue, maps.disparity, maps.cost, left_bad, steps, shape)
         if settings.detail == Detail.DISPARITY:
-            return _Found(disparity, valid), shape
-        queue.launch(doubt, blocks_for(pixels, doubt.block), confidence, valid, pixels)
-        return _Found(disparity, valid, confidence, candidates), shape
+            return _DeviceMaps(disparity, valid), shape
+        queue.launch(
+            zero_invalid_confidence, blocks_for(pixels, zero_invalid_confidence.block), confidence, valid, pixels
+        )
+        return _DeviceMaps(disparity, valid, confidence, candidates), shape
 
-    def _aggregate(self, queue: Queue, scene: Scene, guide: Any, maps: Maps) -> None:
+    def _aggregate(self, queue: Queue, pair: DevicePair, guide: Any, maps: Maps) -> None:
         """Compute the costs, aggregate them and select."""
         cost, aggregation = self.settings.cost, self.settings.aggregation
-        volume = self._cost.volume(queue, cost, scene)
-        shape = scene.height, scene.width
-        self._aggregation.aggregate(queue, aggregation, cost, volume, guide, shape, scene.padded, maps)
+        volume = self._cost.volume(queue, cost, pair)
+        shape = pair.height, pair.width
+        self._aggregation.aggregate(queue, aggregation, cost, volume, guide, shape, pair.padded, maps)
 
     @property
     def _refine(self) -> Any:
-        """What refines on the device, `stereokit_refiners.contract.DeviceRefiner`, or None."""
+        """The refiner on the device, `stereokit_refiners.contract.DeviceRefiner`, or None."""
         return getattr(self.settings.refiner, "on_device", None)
 
 

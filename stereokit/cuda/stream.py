@@ -49,12 +49,12 @@ class DeviceQueue:
         DeviceError
             If the device has not so much memory.
         """
-        held = self._arrays.get(name)
-        if held is None or held.size != size or held.dtype != np.dtype(dtype):
+        array = self._arrays.get(name)
+        if array is None or array.size != size or array.dtype != np.dtype(dtype):
             self._arrays.pop(name, None)  # free the old one before the new one is made
             self._keys.pop(name, None)
-            held = self._arrays[name] = self._new(name, size, dtype)
-        return held
+            array = self._arrays[name] = self._new(name, size, dtype)
+        return array
 
     def _new(self, name: str, size: int, dtype: Any) -> Any:
         try:
@@ -69,10 +69,10 @@ class DeviceQueue:
             ) from None
 
     def _staging(self, name: str, size: int, dtype: Any) -> NDArray[Any]:
-        held = self._pinned.get(name)
-        if held is None or held.size != size or held.dtype != np.dtype(dtype):
-            held = self._pinned[name] = cuda.pinned_array(size, dtype)
-        return held
+        array = self._pinned.get(name)
+        if array is None or array.size != size or array.dtype != np.dtype(dtype):
+            array = self._pinned[name] = cuda.pinned_array(size, dtype)
+        return array
 
     def upload(self, name: str, values: NDArray[Any]) -> Any:
         """Return the resident flat array called `name` with a copy of `values` in it."""
@@ -83,24 +83,24 @@ class DeviceQueue:
             copied.synchronize()  # the pinned buffer may still be on its way
         staging = self._staging(name, values.size, values.dtype)
         np.copyto(staging, values.reshape(-1))
-        held = self.array(name, values.size, values.dtype)
-        held.copy_to_device(staging, stream=self.stream)
+        array = self.array(name, values.size, values.dtype)
+        array.copy_to_device(staging, stream=self.stream)
         copied.record(self.stream)
-        return held
+        return array
 
-    def once(self, name: str, key: Any, make: Callable[[], NDArray[Any]]) -> Any:
+    def cached(self, name: str, key: Any, make: Callable[[], NDArray[Any]]) -> Any:
         """Return the resident copy of a table, uploaded when `key` is not that of the last call."""
         if name not in self._arrays or self._keys.get(name) != key:
             values = np.ascontiguousarray(make()).reshape(-1)
-            held = self.array(name, values.size, values.dtype)
+            array = self.array(name, values.size, values.dtype)
             self.stream.synchronize()  # what still reads the old table
-            held.copy_to_device(values)
+            array.copy_to_device(values)
             self._keys[name] = key
         return self._arrays[name]
 
-    def view(self, held: Any, dtype: Any) -> Any:
+    def view(self, array: Any, dtype: Any) -> Any:
         """Return the same memory as an array of another type."""
-        return held.view(dtype)
+        return array.view(dtype)
 
     def launch(self, what: Kernel, blocks: int, *arguments: Any) -> None:
         """Run a kernel with so many blocks; scalars are converted to its signature."""
@@ -112,16 +112,16 @@ class DeviceQueue:
             self._configured[what.name, blocks] = configured
         configured(*arguments)
 
-    def copy(self, held: Any) -> Any:
+    def copy(self, array: Any) -> Any:
         """Return a new array on the device with the same content."""
-        out = self._new("result", held.size, held.dtype)
-        out.copy_to_device(held, stream=self.stream)
+        out = self._new("result", array.size, array.dtype)
+        out.copy_to_device(array, stream=self.stream)
         return out
 
-    def fetch(self, held: Any) -> NDArray[Any]:
+    def fetch(self, array: Any) -> NDArray[Any]:
         """Wait for all launches and return a copy of an array."""
-        staging = self._staging(f"fetch.{held.dtype}", held.size, held.dtype)
-        held.copy_to_host(staging, stream=self.stream)
+        staging = self._staging(f"fetch.{array.dtype}", array.size, array.dtype)
+        array.copy_to_host(staging, stream=self.stream)
         self.stream.synchronize()
         out: NDArray[Any] = staging.copy()
         return out

@@ -1,1 +1,1 @@
-"""Images on the way in: checks, grey, half size."""
+"""Preparation of input images: checks, grey, half size."""

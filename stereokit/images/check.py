@@ -40,8 +40,8 @@ def check_integer(name: str, value: Any, low: int | None = None, high: int | Non
 
 def check_number(name: str, value: Any, low: float, high: float) -> float:
     """Return `value` as a float if it lies from `low` to `high`, else raise OptionError."""
-    wrong = isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating))
-    if wrong or not low <= value <= high:
+    is_no_number = isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating))
+    if is_no_number or not low <= value <= high:
         raise OptionError(f"{name} must be a number from {low:g} to {high:g}, got {shown(value)}")
     return float(value)
 
@@ -59,20 +59,20 @@ def check_nodata(value: Any) -> float | None:
         return None
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise OptionError(f"nodata must be a number or None, got {shown(value)}")
-    if isinstance(value, int) and abs(value) > 2**64:  # no pixel holds it, nor can a float
+    if isinstance(value, int) and abs(value) > 2**64:  # beyond any pixel, and beyond any float
         raise OptionError(f"nodata must be a value that pixels can have, got {shown(value)}")
     return None if np.isnan(value) else float(value)
 
 
-def check_names(kind: str, given: Any, known: Any) -> None:
-    """Raise OptionError with the nearest known name for the first of `given` that is not in `known`."""
-    for name in given:
+def check_names(kind: str, names: Any, known: Any) -> None:
+    """Raise OptionError with the nearest known name for the first of `names` that is not in `known`."""
+    for name in names:
         if name not in known:
             raise OptionError(did_you_mean(kind, name, known))
 
 
 def writable(array: Any) -> NDArray[Any]:
-    """Return `array`, or a copy, C-contiguous and writable: what kernels were compiled for. It is not written to."""
+    """Return `array`, or a copy, C-contiguous and writable, as the compiled kernels need it; nothing writes to it."""
     contiguous = np.ascontiguousarray(array)
     return contiguous if contiguous.flags.writeable else contiguous.copy()
 
@@ -106,7 +106,7 @@ def checked_image(name: str, image: Any) -> NDArray[Any]:
 def accepted_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:
     """Return the type among `_TYPES`, in this machine's byte order, that takes the values of another; None if none.
 
-    Whole numbers become floats that hold them: what those are in grey is decided by their values, not by their type.
+    Whole numbers become floats that represent them: their values decide about the mapping to grey, not their type.
     """
     native: np.dtype[Any] = dtype.newbyteorder("=")
     if native in _TYPES:

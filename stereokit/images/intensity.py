@@ -1,13 +1,14 @@
-"""How grey values of any type become 8 or 16 bits: one rule for whole images and for those that are read in windows.
+"""The mapping of grey values of any type to 8 or 16 bits: one rule for whole images and for windows of them.
 
 8-bit images stay as they are, and so do floats that hold whole numbers from 0 to 255. For all others a few values
 must not decide: one hot pixel, or GDAL's -3.4e38 for missing pixels, would leave the rest of the pair a handful of
 levels. So the range comes from the **core** of both views together, all values but half a percent at either end:
 
-1. Extreme values that lie apart from the core of the rest, by `_APART` times its width, mark pixels without evidence,
-   as NaN does. At most `_MARKS` different values at either end can be marks. Negative marks of images that have no
-   other negative value (-9999, -1) need lie apart by half its width only: intensities are not negative.
-2. What lies beyond the core by more than half its width is clipped. A pair that reaches less far keeps every level.
+1. Extreme values that lie apart from the core of the rest, by `_MARK_WIDTHS` times its width, mark pixels without
+   evidence, as NaN does. At most `_MAX_MARKS` different values at either end can be marks.
+   Negative marks of images that have no other negative value (-9999, -1) need lie apart by half its width only:
+   intensities are not negative.
+2. Values beyond the core by more than half its width are clipped. A pair of a smaller range keeps every level.
 3. Whole numbers of 16 bits keep their values, other floats are brought to 0 .. 65535.
 
 The core is that of a sample: all pixels of images of up to `_SAMPLE` pixels, else those of a regular grid.
@@ -28,28 +29,37 @@ from numpy.typing import NDArray
 from stereokit.images.check import checked_image
 from stereokit.notices import collecting, warn
 
-__all__ = ["Blocks", "Tone", "display_8bit", "fill_bad", "find_tone", "missing_pixels", "scale_guide", "to_gray"]
+__all__ = [
+    "Blocks",
+    "IntensityMapping",
+    "display_8bit",
+    "fill_bad",
+    "find_mapping",
+    "missing_pixels",
+    "scale_guide",
+    "to_gray",
+]
 
 Blocks = Callable[[], Iterable[tuple[int, NDArray[Any]]]]
-"""Gives the rows of both images, one after another: the first row's number and the block, (h, W) or (h, W, C)."""
+"""A function that yields the rows of both images in blocks: the first row's number and (h, W) or (h, W, C) values."""
 
 _SAMPLE = 2**16
-_TAIL = 0.005  # of the pixels, at either end, that are not of the core
-_REACH = 0.5  # widths of the core that are kept on either side of it
-_APART = 10.0  # widths of the core
-_APART_NEGATIVE = 0.5
-_MARKS = 3
-_ROUNDS = 4  # after each, the rest is looked at again
-_FEWEST = 16  # different values that the rest must have for an extreme one to be a mark
-_LEVELS = 64  # that should hold `_MOST` of the pixels, of the guide's 256
-_MOST = 0.99
-_EIGHT, _SIXTEEN = np.dtype(np.uint8), np.dtype(np.uint16)
-_WHOLE = ((255, _EIGHT), (65535, _SIXTEEN))
+_TAIL_SHARE = 0.005  # of the pixels, at either end, that are not of the core
+_CLIP_WIDTHS = 0.5  # widths of the core that are not clipped on either side of it
+_MARK_WIDTHS = 10.0  # widths of the core
+_NEGATIVE_MARK_WIDTHS = 0.5
+_MAX_MARKS = 3
+_ROUNDS = 4  # of the search for marks, each without the marks of the rounds before
+_MIN_VALUES = 16  # different values that the rest must have for an extreme one to be a mark
+_MIN_LEVELS = 64  # of the guide's 256 for `_LEVEL_SHARE` of the pixels; fewer give a warning
+_LEVEL_SHARE = 0.99
+_UINT8, _UINT16 = np.dtype(np.uint8), np.dtype(np.uint16)
+_INTEGER_TYPES = ((255, _UINT8), (65535, _UINT16))
 
 
 @dataclass(frozen=True)
-class Tone:
-    """How both images of a pair become grey integers.
+class IntensityMapping:
+    """The mapping of both images of a pair to grey integers.
 
     Attributes
     ----------
@@ -57,8 +67,8 @@ class Tone:
         uint8 or uint16: of the result.
     nodata : float or None
         Value of pixels without evidence, as the user gave it.
-    whole : numpy.dtype or None
-        Floats hold whole numbers and are cast to this before they go grey.
+    integer_type : numpy.dtype or None
+        The type that floats with whole numbers are cast to before the conversion to grey.
     scaled : bool
         Floats are brought from `low` .. `high` to 16 bits.
     low, high : float
@@ -69,7 +79,7 @@ class Tone:
 
     kind: np.dtype[Any]
     nodata: float | None = None
-    whole: np.dtype[Any] | None = None
+    integer_type: np.dtype[Any] | None = None
     scaled: bool = False
     low: float = 0.0
     high: float = 65535.0
@@ -86,14 +96,14 @@ class Tone:
         if gray.dtype.kind == "f":
             marks = ~np.isfinite(gray)
         if math.isfinite(self.below) or math.isfinite(self.above):
-            beyond = (gray < self.below) | (gray > self.above)
-            marks = beyond if marks is None else marks | beyond
+            out_of_range = (gray < self.below) | (gray > self.above)
+            marks = out_of_range if marks is None else marks | out_of_range
         if marks is not None and marks.any():
             missing = marks if missing is None else missing | marks
-        if self.whole is not None:
+        if self.integer_type is not None:
             if missing is not None:
                 colors = np.where(missing if colors.ndim == 2 else missing[:, :, None], 0, colors)
-            gray = to_gray(colors.astype(self.whole))
+            gray = to_gray(colors.astype(self.integer_type))
         return gray, missing
 
     def apply(self, block: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
@@ -122,10 +132,10 @@ class Tone:
         return (0, 65535) if self.scaled else (int(self.low), int(self.high))
 
 
-def find_tone(
+def find_mapping(
     blocks: Blocks, dtype: np.dtype[Any], shape: tuple[int, ...], nodata: float | None = None
-) -> Tone:  # fmt: skip
-    """Return how two images of one type become grey integers.
+) -> IntensityMapping:  # fmt: skip
+    """Return the mapping of two images of one type to grey integers.
 
     Parameters
     ----------
@@ -143,38 +153,38 @@ def find_tone(
     StereokitWarning
         If fewer than 64 of the guide's 256 levels hold 99 % of the pixels, of an image that has more.
     """
-    tone = Tone(_EIGHT, nodata)
+    mapping = IntensityMapping(_UINT8, nodata)
     if dtype == np.uint8:
-        return tone
+        return mapping
     step = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _SAMPLE)))
     for _ in range(_ROUNDS):
         if dtype.kind == "f":
-            tone = replace(tone, whole=_whole(replace(tone, whole=None), blocks))
-        if tone.whole == _EIGHT:
-            return tone
-        sample, low, high = _survey(tone, blocks, step)
+            mapping = replace(mapping, integer_type=_integer_type(replace(mapping, integer_type=None), blocks))
+        if mapping.integer_type == _UINT8:
+            return mapping
+        sample, low, high = _grey_sample(mapping, blocks, step)
         if dtype == np.uint16 and high <= 255:
-            return tone
-        below, above = _marks(sample)
+            return mapping
+        below, above = _mark_limits(sample)
         if math.isinf(below) and math.isinf(above):
             break
-        tone = replace(tone, below=max(tone.below, below), above=min(tone.above, above))
+        mapping = replace(mapping, below=max(mapping.below, below), above=min(mapping.above, above))
     if sample.size > 0:
         first, last = _core(sample)
-        reach = _REACH * last - _REACH * first
+        reach = _CLIP_WIDTHS * last - _CLIP_WIDTHS * first
         low, high = max(low, first - reach), min(high, last + reach)
-    if dtype.kind == "f" and tone.whole is None:
-        tone = replace(tone, kind=_SIXTEEN if high > low else _EIGHT, scaled=True, low=low, high=high)
+    if dtype.kind == "f" and mapping.integer_type is None:
+        mapping = replace(mapping, kind=_UINT16 if high > low else _UINT8, scaled=True, low=low, high=high)
     elif high >= low:
         low, high = math.floor(low), math.ceil(high)
-        tone = replace(tone, kind=_SIXTEEN if high > 255 else _EIGHT, low=low, high=high)
-    if tone.kind == _SIXTEEN:
+        mapping = replace(mapping, kind=_UINT16 if high > 255 else _UINT8, low=low, high=high)
+    if mapping.kind == _UINT16:
         _check_levels(sample, low, high)
-    return tone
+    return mapping
 
 
 def display_8bit(image: Any, nodata: float | None = None) -> NDArray[np.uint8]:
-    """Return an image as it should be shown: 8 bits over the range that its values have, but for outliers.
+    """Return an image for display: 8 bits over the range of its values without outliers.
 
     Parameters
     ----------
@@ -197,16 +207,16 @@ def display_8bit(image: Any, nodata: float | None = None) -> NDArray[np.uint8]:
     colors = array[:, :, :3] if array.ndim == 3 else array
     plane = colors.reshape(colors.shape[0], -1)  # colours side by side: one range for all
     with collecting():
-        tone = find_tone(lambda: [(0, plane)], plane.dtype, plane.shape, nodata)
-    gray, unknown = tone.apply(plane)
-    shown: NDArray[np.uint8] = tone.guide(gray).reshape(colors.shape).copy()
-    if tone.low == tone.high > 0:  # one level: white
-        shown[:] = 255
-    if unknown is not None:
-        shown.reshape(plane.shape)[unknown] = 0
+        mapping = find_mapping(lambda: [(0, plane)], plane.dtype, plane.shape, nodata)
+    gray, marked = mapping.apply(plane)
+    picture: NDArray[np.uint8] = mapping.guide(gray).reshape(colors.shape).copy()
+    if mapping.low == mapping.high > 0:  # one level: white
+        picture[:] = 255
+    if marked is not None:
+        picture.reshape(plane.shape)[marked] = 0
     if missing is not None:
-        shown[missing] = 0
-    return shown
+        picture[missing] = 0
+    return picture
 
 
 def to_gray(array: NDArray[Any]) -> NDArray[Any]:
@@ -219,7 +229,7 @@ def to_gray(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _gray_of_floats(array: NDArray[Any]) -> NDArray[Any]:
-    """Return floats in grey; one operation after the other, as neither OpenCV nor BLAS does on every processor."""
+    """Return floats in grey, by single operations in a fixed order: OpenCV and BLAS differ between processors."""
     with np.errstate(over="ignore", invalid="ignore"):  # inf - inf, inf * 0: such pixels are bad ones
         gray = array[:, :, 0] * array.dtype.type(0.299)
         for channel, weight in ((1, 0.587), (2, 0.114)):
@@ -245,10 +255,10 @@ def fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
     """Return `image` with bad pixels replaced by the nearest good one before them on the row, else behind."""
     width = image.shape[1]
     columns = np.where(bad, -1, np.arange(width))
-    before = np.maximum.accumulate(columns, axis=1)
+    previous = np.maximum.accumulate(columns, axis=1)
     columns = np.where(bad, width, np.arange(width))
-    behind = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
-    source = np.where(before >= 0, before, behind)
+    following = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
+    source = np.where(previous >= 0, previous, following)
     empty = source >= width
     filled = np.take_along_axis(image, np.where(empty, 0, source), axis=1)
     filled[empty] = 0
@@ -269,29 +279,31 @@ def _scale_to_16_bits(image: NDArray[Any], low: float, high: float) -> NDArray[n
     return np.rint(share * 65535).astype(np.uint16)
 
 
-def _whole(tone: Tone, blocks: Blocks) -> np.dtype[Any] | None:
+def _integer_type(mapping: IntensityMapping, blocks: Blocks) -> np.dtype[Any] | None:
     """Return the smallest type that holds all values with evidence as whole numbers, None if there is none."""
-    found = 0
+    index = 0
     for _, block in blocks():
-        missing = tone.gray(block)[1]
+        missing = mapping.gray(block)[1]
         colors = block[:, :, :3] if block.ndim == 3 else block
         values = colors if missing is None else colors[~missing]
         with np.errstate(invalid="ignore"):
-            while found < 2 and values.size and not (
-                np.array_equal(values.astype(_WHOLE[found][1]), values) and values.max() <= _WHOLE[found][0]
-            ):  # fmt: skip
-                found += 1
-        if found == 2:
+            while index < 2 and values.size and not _are_integers(values, *_INTEGER_TYPES[index]):
+                index += 1
+        if index == 2:
             return None
-    return _WHOLE[found][1]
+    return _INTEGER_TYPES[index][1]
 
 
-def _survey(tone: Tone, blocks: Blocks, step: int) -> tuple[NDArray[Any], float, float]:
+def _are_integers(values: NDArray[Any], highest: int, dtype: np.dtype[Any]) -> bool:
+    return bool(np.array_equal(values.astype(dtype), values) and values.max() <= highest)
+
+
+def _grey_sample(mapping: IntensityMapping, blocks: Blocks, step: int) -> tuple[NDArray[Any], float, float]:
     """Return the sorted sample of the grey values with evidence, and the smallest and largest of all such."""
     parts = []
     low, high = math.inf, -math.inf
     for y0, block in blocks():
-        gray, missing = tone.gray(block)
+        gray, missing = mapping.gray(block)
         values = gray if missing is None else gray[~missing]
         if values.size:
             low, high = min(low, float(values.min())), max(high, float(values.max()))
@@ -304,25 +316,28 @@ def _survey(tone: Tone, blocks: Blocks, step: int) -> tuple[NDArray[Any], float,
 
 def _core(sample: NDArray[Any]) -> tuple[float, float]:
     """Return the smallest and the largest value of a sorted sample without its tails."""
-    tail = int(_TAIL * sample.size)
+    tail = int(_TAIL_SHARE * sample.size)
     return float(sample[tail]), float(sample[sample.size - 1 - tail])
 
 
-def _marks(sample: NDArray[Any]) -> tuple[float, float]:
-    """Return below and above what values a sorted sample has marks of missing pixels; infinite where it has none."""
-    few = int(_TAIL / 2 * sample.size)
-    for part in (sample[few : sample.size - few], sample):  # without hot pixels, which may lie beyond a mark, and with
-        found = _marks_at_the_ends(part)
-        if found is not None:
-            return found
+def _mark_limits(sample: NDArray[Any]) -> tuple[float, float]:
+    """Return the limits of a sorted sample beyond which values mark missing pixels; infinite where there are none."""
+    tail = int(_TAIL_SHARE / 2 * sample.size)
+    for part in (
+        sample[tail : sample.size - tail],
+        sample,
+    ):  # without hot pixels beyond a mark, and with them
+        limits = _extreme_marks(part)
+        if limits is not None:
+            return limits
     return -math.inf, math.inf
 
 
-def _marks_at_the_ends(sample: NDArray[Any]) -> tuple[float, float] | None:
+def _extreme_marks(sample: NDArray[Any]) -> tuple[float, float] | None:
     starts = np.concatenate([[0], np.flatnonzero(sample[1:] != sample[:-1]) + 1, [sample.size]])
-    found, most = None, 0
-    for lower, upper in itertools.product(range(_MARKS + 1), repeat=2):
-        if lower + upper <= most or starts.size - 1 - lower - upper < _FEWEST:
+    limits, mark_count = None, 0
+    for lower, upper in itertools.product(range(_MAX_MARKS + 1), repeat=2):
+        if lower + upper <= mark_count or starts.size - 1 - lower - upper < _MIN_VALUES:
             continue
         rest = sample[starts[lower] : starts[-1 - upper]]
         low, high = _core(rest)
@@ -331,16 +346,16 @@ def _marks_at_the_ends(sample: NDArray[Any]) -> tuple[float, float] | None:
         below, above = -math.inf, math.inf
         if lower > 0:
             mark = float(sample[starts[lower] - 1])
-            if low - mark <= (high - low) * (_APART_NEGATIVE if mark < 0 <= rest[0] else _APART):
+            if low - mark <= (high - low) * (_NEGATIVE_MARK_WIDTHS if mark < 0 <= rest[0] else _MARK_WIDTHS):
                 continue
             below = 0.999 * mark + 0.001 * low  # grey of colours may differ from the mark in its last bits
         if upper > 0:
             mark = float(sample[starts[-1 - upper]])
-            if mark - high <= (high - low) * _APART:
+            if mark - high <= (high - low) * _MARK_WIDTHS:
                 continue
             above = 0.999 * mark + 0.001 * high
-        found, most = (below, above), lower + upper
-    return found
+        limits, mark_count = (below, above), lower + upper
+    return limits
 
 
 def _check_levels(sample: NDArray[Any], low: float, high: float) -> None:
@@ -349,10 +364,10 @@ def _check_levels(sample: NDArray[Any], low: float, high: float) -> None:
         return
     levels = scale_guide(_scale_to_16_bits(sample, low, high), 0, 65535)
     counts = np.sort(np.bincount(levels, minlength=256))[::-1]
-    held = 1 + int(np.searchsorted(np.cumsum(counts), _MOST * sample.size))
-    different = 1 + np.count_nonzero(sample[1:] != sample[:-1])
-    if held < _LEVELS and different > 2 * held:
+    level_count = 1 + int(np.searchsorted(np.cumsum(counts), _LEVEL_SHARE * sample.size))
+    value_count = 1 + np.count_nonzero(sample[1:] != sample[:-1])
+    if level_count < _MIN_LEVELS and value_count > 2 * level_count:
         warn(
-            f"left and right: {held} of 256 grey levels hold 99 % of the pixels between {low:g} and {high:g}; if "
-            "some of these values mark missing pixels, give it as nodata"
+            f"left and right: {level_count} of 256 grey levels hold 99 % of the pixels between {low:g} and {high:g}; "
+            "if some of these values mark missing pixels, give it as nodata"
         )

@@ -1,4 +1,4 @@
-"""The checks of maps and volumes that public functions take; kernels and the matcher check nothing again."""
+"""Checks of the maps and volumes of public functions; kernels and the matcher check nothing again."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""CUDA twins of what happens to images before matching: grey, half size, Gaussian; and their ranges.
+"""CUDA twins of the preparation of images: grey, half size, Gaussian blur; and the ranges of values.
 
 All are integers and equal `stereokit.images.gray` and `stereokit.images.resize` to the last bit. OpenCV makes grey
 with 15-bit weights, rounds the mean of four pixels half up, and blurs 16-bit images with 16-bit weights and one
-rounding at the end; its weights are asked of OpenCV itself, by blurring an impulse.
+rounding at the end. The weights come from OpenCV itself: it blurs an impulse.
 
 The two images of a pair lie behind one another in one array, ``(2, H, W)`` flat, so that each stage is one launch.
 """
@@ -48,29 +48,29 @@ __all__ = [
 KINDS = {np.dtype(np.uint8): u8, np.dtype(np.uint16): u16}
 
 _PARTS = 32
-"""Blocks that look at one image for its range: as many as a warp has lanes."""
+"""Blocks that search one image for its range: as many as a warp has lanes."""
 
 
 @device
 def clamped(value, last):  # type: ignore[no-untyped-def]
-    """Return `value`, held to 0..`last`."""
+    """Return `value`, clamped to 0..`last`."""
     return i32(min(max(i32(value), i32(0)), i32(last)))
 
 
 @cache
 def take_kernel(dtype: np.dtype[Any]) -> Kernel:
-    """Return the kernel that copies an image, grey or RGB, into its place, mirrored if asked for."""
+    """Return the kernel that copies an image, grey or RGB, into its place, mirrored on request."""
     kind = KINDS[dtype]
 
     @kernel(array(kind), array(kind), i32, i32, i32, i32, i32, block=128, name=f"take_{dtype}")
     def take(image, out, place, channels, mirrored, height, width):  # type: ignore[no-untyped-def]
-        at = u32(cuda.grid(1))
+        index = u32(cuda.grid(1))
         pixels = u32(u32(height) * u32(width))
-        if at < pixels:
-            x = u32(at % u32(width))
-            source = at
+        if index < pixels:
+            x = u32(index % u32(width))
+            source = index
             if mirrored != 0:
-                source = u32(u32(at - x) + u32(u32(width) - u32(1) - x))
+                source = u32(u32(index - x) + u32(u32(width) - u32(1) - x))
             value = kind(0)
             if channels == 1:
                 value = image[source]
@@ -80,10 +80,10 @@ def take_kernel(dtype: np.dtype[Any]) -> Kernel:
                 green = u32(u32(image[u32(source + u32(1))]) * u32(19235))
                 blue = u32(u32(image[u32(source + u32(2))]) * u32(3735))
                 value = kind(u32(red + green + blue + u32(16384)) >> u32(15))
-            out[u32(u32(place) * pixels + at)] = value
+            out[u32(u32(place) * pixels + index)] = value
 
-    made: Kernel = take
-    return made
+    result: Kernel = take
+    return result
 
 
 @cache
@@ -95,10 +95,10 @@ def halve_kernel(dtype: np.dtype[Any]) -> Kernel:
     def halve(images, out, count, height, width, largest):  # type: ignore[no-untyped-def]
         down = u32((u32(height) + u32(1)) >> u32(1))
         across = u32((u32(width) + u32(1)) >> u32(1))
-        at = u32(cuda.grid(1))
-        if at < u32(u32(count) * down * across):
-            x = u32(at % across)
-            row = u32(at // across)
+        index = u32(cuda.grid(1))
+        if index < u32(u32(count) * down * across):
+            x = u32(index % across)
+            row = u32(index // across)
             y = u32(row % down)
             base = u32(u32(row // down) * u32(height))
             y0 = u32(u32(base + u32(2) * y) * u32(width))
@@ -108,10 +108,10 @@ def halve_kernel(dtype: np.dtype[Any]) -> Kernel:
             a, b = u32(images[u32(y0 + x0)]), u32(images[u32(y0 + x1)])
             c, d = u32(images[u32(y1 + x0)]), u32(images[u32(y1 + x1)])
             mean = u32(u32(a + b + c + d + u32(2)) >> u32(2))
-            out[at] = kind(max(max(a, b), max(c, d)) if largest != 0 else mean)
+            out[index] = kind(max(max(a, b), max(c, d)) if largest != 0 else mean)
 
-    made: Kernel = halve
-    return made
+    result: Kernel = halve
+    return result
 
 
 @cache
@@ -122,34 +122,34 @@ def blur_rows_kernel(dtype: np.dtype[Any]) -> Kernel:
 
     @kernel(array(kind), array(u32), i32, array(u32), i32, i32, block=128, name=f"blur_rows_{dtype}")
     def blur_rows(images, weights, half, out, rows, width):  # type: ignore[no-untyped-def]
-        at = u32(cuda.grid(1))
-        if at < u32(u32(rows) * u32(width)):
-            x = u32(at % u32(width))
-            row = u32(at - x)
+        index = u32(cuda.grid(1))
+        if index < u32(u32(rows) * u32(width)):
+            x = u32(index % u32(width))
+            row = u32(index - x)
             total = u32(0)
             for k in range(2 * half + 1):
                 column = clamped(i32(x) + i32(k) - half, width - 1)
                 total = u32(total + u32(weights[u32(k)] * u32(images[u32(row + u32(column))])))
-            out[at] = u32(total * u32(times))
+            out[index] = u32(total * u32(times))
 
-    made: Kernel = blur_rows
-    return made
+    result: Kernel = blur_rows
+    return result
 
 
 @kernel(array(u32), array(u32), i32, array(u16), i32, i32, i32, block=128)
 def blur_columns(rows, weights, half, out, count, height, width):  # type: ignore[no-untyped-def]
     """Blur the columns of `count` images whose rows were blurred."""
-    at = u32(cuda.grid(1))
-    if at < u32(u32(count) * u32(height) * u32(width)):
-        x = u32(at % u32(width))
-        row = u32(at // u32(width))
+    index = u32(cuda.grid(1))
+    if index < u32(u32(count) * u32(height) * u32(width)):
+        x = u32(index % u32(width))
+        row = u32(index // u32(width))
         y = u32(row % u32(height))
         base = u32(row - y)
         total = u64(1 << 31)
         for k in range(2 * half + 1):
             other = clamped(i32(y) + i32(k) - half, height - 1)
             total = u64(total + u64(weights[u32(k)]) * u64(rows[u32(u32(base + u32(other)) * u32(width) + x)]))
-        out[at] = u16(total >> u64(32))
+        out[index] = u16(total >> u64(32))
 
 
 @cache
@@ -166,11 +166,11 @@ def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
         block = u32(cuda.blockIdx.x)
         first = u32(u32(block // u32(_PARTS)) * u32(pixels))
         low, high = i32(65535), i32(0)
-        at = u32(u32(u32(block % u32(_PARTS)) * u32(threads)) + thread)
-        while at < u32(pixels):
-            value = i32(images[u32(first + at)])
+        index = u32(u32(u32(block % u32(_PARTS)) * u32(threads)) + thread)
+        while index < u32(pixels):
+            value = i32(images[u32(first + index)])
             low, high = min(low, value), max(high, value)
-            at = u32(at + u32(threads * _PARTS))
+            index = u32(index + u32(threads * _PARTS))
         for mask in (16, 8, 4, 2, 1):
             low = min(low, shuffle_xor(low, mask))
             high = max(high, shuffle_xor(high, mask))
@@ -185,8 +185,8 @@ def ranges_kernel(dtype: np.dtype[Any]) -> Kernel:
             out[u32(u32(2) * block)] = low
             out[u32(u32(2) * block + u32(1))] = high
 
-    made: Kernel = ranges
-    return made
+    result: Kernel = ranges
+    return result
 
 
 @kernel(array(i32), array(i32), block=64)
@@ -206,10 +206,10 @@ def join_ranges(parts, out):  # type: ignore[no-untyped-def]
 @kernel(array(f32), array(f32), i32, i32, block=128)
 def flip(image, out, height, width):  # type: ignore[no-untyped-def]
     """Mirror a map."""
-    at = u32(cuda.grid(1))
-    if at < u32(u32(height) * u32(width)):
-        x = u32(at % u32(width))
-        out[u32(u32(at - x) + u32(u32(width) - u32(1) - x))] = image[at]
+    index = u32(cuda.grid(1))
+    if index < u32(u32(height) * u32(width)):
+        x = u32(index % u32(width))
+        out[u32(u32(index - x) + u32(u32(width) - u32(1) - x))] = image[index]
 
 
 for _dtype in KINDS:
@@ -243,8 +243,17 @@ def take(
     shape: tuple[int, int],
 ) -> None:  # fmt: skip
     """Put one image, ``(H, W)`` or ``(H, W, 3)`` flat, as a grey one into place `place` of `out`."""
-    made = take_kernel(dtype)
-    queue.launch(made, blocks_for(shape[0] * shape[1], made.block), image, out, place, channels, int(mirrored), *shape)
+    copy_kernel = take_kernel(dtype)
+    queue.launch(
+        copy_kernel,
+        blocks_for(shape[0] * shape[1], copy_kernel.block),
+        image,
+        out,
+        place,
+        channels,
+        int(mirrored),
+        *shape,
+    )
 
 
 def halve(
@@ -253,8 +262,8 @@ def halve(
     """Return `count` images at half size: the mean of 2x2 pixels, or the `largest` of them."""
     size = count * ((shape[0] + 1) // 2) * ((shape[1] + 1) // 2)
     out = queue.array(name, size, dtype)
-    made = halve_kernel(dtype)
-    queue.launch(made, blocks_for(size, made.block), images, out, count, *shape, int(largest))
+    mean_kernel = halve_kernel(dtype)
+    queue.launch(mean_kernel, blocks_for(size, mean_kernel.block), images, out, count, *shape, int(largest))
     return out
 
 
@@ -262,12 +271,12 @@ def smooth(queue: Queue, images: Any, dtype: np.dtype[Any], sigma: float, shape:
     """Return both images blurred, 16 bit, as `stereokit.images.resize.smooth` does; `sigma` is above 0."""
     height, width = shape
     size = 2 * height * width
-    weights = queue.once("smooth.weights", sigma, lambda: gaussian_weights(sigma))
+    weights = queue.cached("smooth.weights", sigma, lambda: gaussian_weights(sigma))
     half = gaussian_weights(sigma).size // 2
     rows = queue.array("smooth.rows", size, np.uint32)
     out = queue.array("smooth.out", size, np.uint16)
-    made = blur_rows_kernel(dtype)
-    queue.launch(made, blocks_for(size, made.block), images, weights, half, rows, 2 * height, width)
+    row_kernel = blur_rows_kernel(dtype)
+    queue.launch(row_kernel, blocks_for(size, row_kernel.block), images, weights, half, rows, 2 * height, width)
     queue.launch(blur_columns, blocks_for(size, blur_columns.block), rows, weights, half, out, 2, height, width)
     return out
 

@@ -1,7 +1,8 @@
-"""What happens to a grey pair before it is matched: half size, and a Gaussian."""
+"""The preparation of a grey pair: half size, and a Gaussian blur."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,7 +15,7 @@ from stereokit.images.intensity import scale_guide
 from stereokit.kernels.threads import run
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["half_size", "reduced", "smooth"]
+__all__ = ["half_size", "reduced", "reduced_mask", "smooth"]
 
 
 def smooth(
@@ -31,30 +32,30 @@ def smooth(
     sigma : float
         Standard deviation in pixels; 0 returns the pair itself.
     workspace : Workspace or None
-        Where the smoothed images are kept until the next call; None makes new ones.
+        The owner of the buffers of the smoothed images, which the next call overwrites; None makes new ones.
     threads : int
         Threads to use.
     eight_bits : bool
-        Whether the result is of 8 bits, whatever the pair is.
+        Whether the result is of 8 bits, for pairs of 16 bits too.
     """
     if eight_bits and pair.left.dtype != np.uint8:
         left, right = scale_guide(pair.left, *pair.span), scale_guide(pair.right, *pair.span)
-        pair = GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide)
+        pair = replace(pair, left=left, right=right, ranges=None, span=(0, 65535))
     if sigma == 0:
         return pair
-    held = workspace or Workspace()
+    buffers = workspace or Workspace()
     images = pair.left, pair.right
-    wide, blurred = ([held.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
+    deep, blurred = ([buffers.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
 
     def blur(k: int) -> None:
         image = images[k]
         if image.dtype == np.uint8:
-            image = np.multiply(image, np.uint16(256), out=wide[k])
+            image = np.multiply(image, np.uint16(256), out=deep[k])
         cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
 
     run([partial(blur, 0), partial(blur, 1)], threads)
     left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
-    return GrayPair(left, right, pair.left_bad, pair.right_bad, pair.guide, pair.ranges, pair.span)
+    return replace(pair, left=left, right=right)
 
 
 def reduced(pair: GrayPair, step: int) -> GrayPair:
@@ -76,13 +77,29 @@ def half_size(pair: GrayPair) -> GrayPair:
         size = (even.shape[1] // 2, even.shape[0] // 2)
         return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0])
 
-    def shrink_bad(bad: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-        if bad is None:
-            return None
-        height, width = bad.shape
-        even = np.pad(bad, ((0, height % 2), (0, width % 2)))
-        return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))
-
     left, right = shrink(pair.left), shrink(pair.right)
     guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
-    return GrayPair(left, right, shrink_bad(pair.left_bad), shrink_bad(pair.right_bad), guide, pair.ranges, pair.span)
+    return replace(
+        pair,
+        left=left,
+        right=right,
+        guide=guide,
+        left_bad=_half_mask(pair.left_bad),
+        right_bad=_half_mask(pair.right_bad),
+        left_blank=_half_mask(pair.left_blank),
+    )
+
+
+def reduced_mask(mask: NDArray[np.bool_] | None, step: int) -> NDArray[np.bool_] | None:
+    """Return a mask at 1/`step` of its size, as `reduced` does it."""
+    while step > 1:
+        mask, step = _half_mask(mask), step // 2
+    return mask
+
+
+def _half_mask(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    if mask is None:
+        return None
+    height, width = mask.shape
+    even = np.pad(mask, ((0, height % 2), (0, width % 2)))
+    return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))

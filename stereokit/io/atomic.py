@@ -1,10 +1,9 @@
-"""Files and folders as such: checked before work, written whole or not at all.
+"""Output files and folders: checked before work, written whole or not at all.
 
-Every writer builds the whole file first, writes it to a temporary name beside the target and then renames it, so that a
-failure never leaves half a file. A link stays a link, what it points to is replaced, and a file keeps its permissions;
-what is no file (a pipe, a device) is written to. A process that is killed leaves its temporary file: it was locked for
-as long as it was being written, so the next process that writes to the folder knows that nobody needs it, and removes
-it.
+Every writer builds the whole file first, writes it to a temporary name in the target's folder and then renames it, so
+that a failure never leaves half a file. A link stays a link and its target is replaced; a file keeps its permissions; a
+pipe or a device is written to. A killed process leaves its temporary file. The lock of that file ends with the process,
+so the next process that writes to the folder recognises the file as abandoned, and removes it.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ __all__ = [
 ]
 
 _TEMPORARY = re.compile(r"\.stereokit-[0-9a-f]{16}\.tmp")
-_swept: set[str] = set()  # folders
-_locks: Any = None  # on Windows a file that is open cannot be renamed, and so is not locked
+_clean_folders: set[str] = set()  # without abandoned files, once in a process
+_locks: Any = None  # none on Windows, where an open file cannot be renamed
 with suppress(ModuleNotFoundError):
     _locks = importlib.import_module("fcntl")
 
@@ -48,7 +47,7 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = (), n
     suffixes : tuple of str
         The suffixes that are known, lower case with their dot; empty to take any.
     name : str
-        What the message calls the argument.
+        The argument's name in messages.
 
     Raises
     ------
@@ -68,7 +67,7 @@ def check_output(path: str | os.PathLike[str], suffixes: tuple[str, ...] = (), n
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path; what is written there gets the name `path` when the block ends well.
+    """Give a temporary path; the file there gets the name `path` when the block ends without an error.
 
     Raises
     ------
@@ -92,8 +91,8 @@ def _behind_link(path: Path) -> Path:
 
 @contextmanager
 def _renamed(target: Path, mode: int | None) -> Iterator[Path]:
-    """Give a temporary path beside `target`, and rename what is there."""
-    _sweep(target.parent)
+    """Give a temporary path in the folder of `target`, and rename the file there."""
+    _remove_leftovers(target.parent)
     temporary, lock = _new_temporary(target.parent)
     try:
         try:
@@ -111,46 +110,47 @@ def _renamed(target: Path, mode: int | None) -> Iterator[Path]:
 
 @contextmanager
 def _piped(target: Path) -> Iterator[Path]:
-    """Give a temporary path, and pass what is there on to what is no file."""
+    """Give a temporary path, and copy its content to `target`, a pipe or a device."""
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     with tempfile.TemporaryDirectory(prefix="stereokit-") as folder:
         temporary = Path(folder, "content")
         yield temporary
         try:
-            place = os.open(target, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe that nobody reads is refused
+            # O_NONBLOCK refuses a pipe that nobody reads.
+            descriptor = os.open(target, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
         except OSError as error:
             if error.errno == errno.ENXIO:
                 raise OSError(errno.ENXIO, "nobody reads from the other end") from error
             raise
-        os.set_blocking(place, True)
-        with temporary.open("rb") as source, os.fdopen(place, "wb") as sink:
+        os.set_blocking(descriptor, True)
+        with temporary.open("rb") as source, os.fdopen(descriptor, "wb") as sink:
             shutil.copyfileobj(source, sink)
 
 
 def _new_temporary(folder: Path) -> tuple[Path, int | None]:
-    """Make an empty file in a folder; return its path and the descriptor that locks it."""
+    """Create an empty file in a folder; return its path and the descriptor that locks it."""
     while True:
         path = folder / f".stereokit-{secrets.token_hex(8)}.tmp"
-        place = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         if _locks is None:
-            os.close(place)
+            os.close(descriptor)
             return path, None
         try:
-            _locks.flock(place, _locks.LOCK_EX | _locks.LOCK_NB)
-        except OSError:  # another process took it for one that was left, or the file system has no locks
+            _locks.flock(descriptor, _locks.LOCK_EX | _locks.LOCK_NB)
+        except OSError:  # another process took it for an abandoned one, or the file system has no locks
             pass
         if path.exists():
-            return path, place
-        os.close(place)
+            return path, descriptor
+        os.close(descriptor)
 
 
-def _sweep(folder: Path) -> None:
+def _remove_leftovers(folder: Path) -> None:
     """Remove the temporary files that killed processes left in a folder, once in a process."""
-    where = os.path.abspath(folder)
-    if where in _swept or _locks is None:
+    folder_path = os.path.abspath(folder)
+    if folder_path in _clean_folders or _locks is None:
         return
-    _swept.add(where)
+    _clean_folders.add(folder_path)
     try:
         with os.scandir(folder) as entries:
             names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name)]
@@ -158,16 +158,16 @@ def _sweep(folder: Path) -> None:
         return
     for name in names:
         try:
-            place = os.open(folder / name, os.O_RDWR | os.O_NOFOLLOW)
+            descriptor = os.open(folder / name, os.O_RDWR | os.O_NOFOLLOW)
         except OSError:
             continue
         try:
-            _locks.flock(place, _locks.LOCK_EX | _locks.LOCK_NB)
+            _locks.flock(descriptor, _locks.LOCK_EX | _locks.LOCK_NB)
             os.unlink(folder / name)
         except OSError:  # somebody is writing it
             pass
         finally:
-            os.close(place)
+            os.close(descriptor)
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -183,17 +183,17 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def make_folder(name: str, path: str | os.PathLike[str]) -> None:
-    """Make the folder `path` and those above it, unless it is there.
+    """Create the folder `path` and its parents, unless it exists.
 
     Parameters
     ----------
     name : str
-        What the caller's argument is called, for the message.
+        The caller's argument, for the message.
 
     Raises
     ------
     FileError
-        If it cannot be made.
+        If it cannot be created.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)

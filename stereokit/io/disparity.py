@@ -29,9 +29,9 @@ __all__ = [
 ]
 
 DISPARITY_SUFFIXES = (".png", ".pfm", ".npy", ".tiff")
-"""What `read_disparity` and `write_disparity` know; ``.tif`` is taken as ``.tiff``."""
+"""The suffixes of `read_disparity` and `write_disparity`; ``.tif`` is ``.tiff``."""
 
-_MOST = 65535  # of a KITTI PNG
+_MAX_STEP = 65535  # of a KITTI PNG
 _STEPS = 16  # of OpenCV's fixed point in a pixel
 
 
@@ -85,16 +85,16 @@ def write_disparity(path: str | os.PathLike[str], disparity: ArrayLike, *, clip:
     ----------
     path : path
         ``.png``: KITTI, 16-bit, 1/256 pixel, 0 where invalid; as in the devkit, a valid 0 becomes 1/256. ``.pfm``:
-        infinite where invalid. ``.npy`` and ``.tiff``: float32, NaN kept.
+        infinite where invalid. ``.npy`` and ``.tiff``: float32 with NaN.
     disparity : (H, W) float
         Pixels, not finite where invalid.
     clip : bool
-        Bring what a ``.png`` cannot say, below 0 and above 65535/256 pixels, to its ends.
+        Clip disparities to the range of a ``.png``, 0 to 65535/256 pixels.
 
     Raises
     ------
     InputError
-        If `disparity` is not a 2-d array of floats, or has values that a ``.png`` cannot say and `clip` is False.
+        If `disparity` is not a 2-d array of floats, or has values beyond the range of a ``.png`` and `clip` is False.
     FileError
         If the suffix is unknown or the file cannot be written.
     """
@@ -103,13 +103,13 @@ def write_disparity(path: str | os.PathLike[str], disparity: ArrayLike, *, clip:
     known = np.isfinite(values)
     if suffix == ".png":
         steps = np.rint(np.where(known, values, np.float32(0)) * np.float32(256))
-        if not clip and (values.min(initial=0, where=known) < 0 or steps.max() > _MOST):
+        if not clip and (values.min(initial=0, where=known) < 0 or steps.max() > _MAX_STEP):
             span = f"{values.min(initial=np.inf, where=known):g} .. {values.max(initial=-np.inf, where=known):g}"
             raise InputError(
-                f"disparity must not be negative or above {_MOST / 256:g} px for KITTI's .png, got {span}; "
+                f"disparity must not be negative or above {_MAX_STEP / 256:g} px for KITTI's .png, got {span}; "
                 "use .pfm, .npy or .tiff, or clip=True"
             )
-        data = encode(".png", np.where(known, np.clip(steps, 1, _MOST), 0).astype(np.uint16))
+        data = encode(".png", np.where(known, np.clip(steps, 1, _MAX_STEP), 0).astype(np.uint16))
     elif suffix == ".pfm":
         data = pfm_bytes(values)
     elif suffix == ".npy":
@@ -127,7 +127,7 @@ def from_opencv(fixed: ArrayLike, min_disparity: int = 0) -> NDArray[np.float32]
     Parameters
     ----------
     fixed : (H, W) int16
-        What ``StereoBM.compute`` and ``StereoSGBM.compute`` return: 16 steps a pixel.
+        The result of ``StereoBM.compute`` or ``StereoSGBM.compute``: 16 steps per pixel.
     min_disparity : int
         The matcher's ``minDisparity``, pixels. ``(min_disparity - 1) * 16`` marks invalid pixels.
 

@@ -1,6 +1,6 @@
 """PFM of Middlebury 2014: rows bottom-up, the sign of the scale gives the byte order, its magnitude is unused.
 
-PFM is read and written here because what OpenCV does with its row order and its scale depends on the version.
+PFM is read and written here because OpenCV's treatment of row order and scale depends on the version.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ def _parsed(path: str | os.PathLike[str], data: bytes) -> NDArray[np.float32]:
         scale = float(header[4])
     except ValueError:
         scale = 0.0
-    expected, present = 4 * width * height, len(data) - header.end()
-    if scale == 0 or expected == 0 or present < expected:
+    expected, received = 4 * width * height, len(data) - header.end()
+    if scale == 0 or expected == 0 or received < expected:
         raise FileError(
             f"{str(path)!r} is a broken PFM: size {width}x{height}, scale {header[4].decode()}, "
-            f"{present} bytes of data where {expected} are needed"
+            f"{received} bytes of data where {expected} are needed"
         )
     values = np.frombuffer(data, "<f4" if scale < 0 else ">f4", width * height, header.end())
     return values.reshape(height, width)[::-1].astype(np.float32)
 
 
 def pfm_bytes(values: NDArray[np.float32]) -> bytes:
-    """Return a map, (H, W) float32, as a grey PFM; what is not finite becomes infinite."""
+    """Return a map, (H, W) float32, as a grey PFM; values that are not finite become infinite."""
     rows = np.where(np.isfinite(values), values, np.float32(np.inf))[::-1].astype("<f4")
     return b"Pf\n%d %d\n-1.0\n" % (values.shape[1], values.shape[0]) + rows.tobytes()

@@ -1,9 +1,9 @@
-"""Decoders that talk: OpenCV, libpng, libjpeg and FFmpeg write lines of their own to standard error.
+"""Silence for decoders: OpenCV, libpng, libjpeg and FFmpeg write lines of their own to standard error.
 
-What they have to say of a broken file is said by the `FileError`. OpenCV has a switch; the C libraries write to the
-descriptor itself, which is pointed elsewhere for as long as a decoder works. That must not swallow what others write
-meanwhile, so it is done only where nobody else can: the program has moved its own standard error to another descriptor
-(as the command line does: `keep_stderr`), or no thread but this package's is there.
+The `FileError` reports a broken file already. OpenCV has a switch; the C libraries write to the descriptor itself,
+which is redirected while a decoder works. That must not swallow lines of others, so it is done only where nobody else
+can write: the program has moved its own standard error to another descriptor (as the command line does:
+`keep_stderr`), or all threads are this package's.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ __all__ = ["keep_stderr", "quiet_decoders"]
 
 _STDERR = 2
 _lock = threading.Lock()
-_inside = 0  # threads that decode
-_before: tuple[int, int | None] = (0, None)  # OpenCV's level; a copy of the descriptor if that points elsewhere now
-_moved = False
+_decoder_count = 0  # threads that decode
+_saved_state: tuple[int, int | None] = (0, None)  # OpenCV's level; a copy of the descriptor if it is redirected
+_is_stderr_moved = False
 
 
 def keep_stderr() -> None:
@@ -30,7 +30,7 @@ def keep_stderr() -> None:
 
     For programs, at their start; nothing happens where ``sys.stderr`` is not the standard one.
     """
-    global _moved
+    global _is_stderr_moved
     try:
         if sys.stderr.fileno() != _STDERR:
             return
@@ -38,45 +38,47 @@ def keep_stderr() -> None:
     except (AttributeError, OSError, ValueError):  # there is none, or it is no file
         return
     sys.stderr = stream
-    _moved = True
+    _is_stderr_moved = True
 
 
 @contextmanager
 def quiet_decoders() -> Iterator[None]:
-    """Silence decoders for the length of a ``with`` block, in which nothing but a decoder is called."""
-    global _inside, _before
+    """Silence decoders for a ``with`` block that calls nothing but a decoder."""
+    global _decoder_count, _saved_state
     with _lock:
-        if _inside == 0:
+        if _decoder_count == 0:
             level = cv2.utils.logging.getLogLevel()
             cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-            _before = level, _point_elsewhere() if _alone() else None
-        _inside += 1
+            _saved_state = level, _redirect_stderr() if _can_redirect() else None
+        _decoder_count += 1
     try:
         yield
     finally:
         with _lock:
-            _inside -= 1
-            if _inside == 0:
-                level, saved = _before
+            _decoder_count -= 1
+            if _decoder_count == 0:
+                level, descriptor = _saved_state
                 cv2.utils.logging.setLogLevel(level)
-                if saved is not None:
-                    os.dup2(saved, _STDERR)
-                    os.close(saved)
+                if descriptor is not None:
+                    os.dup2(descriptor, _STDERR)
+                    os.close(descriptor)
 
 
-def _alone() -> bool:
-    """Return whether nobody but decoders can write to the descriptor now."""
-    this = threading.current_thread()
-    return _moved or all(one is this or one.name.startswith("stereokit") for one in threading.enumerate())
+def _can_redirect() -> bool:
+    """Return whether only decoders can write to the descriptor now."""
+    current = threading.current_thread()
+    return _is_stderr_moved or all(
+        thread is current or thread.name.startswith("stereokit") for thread in threading.enumerate()
+    )
 
 
-def _point_elsewhere() -> int | None:
-    """Point the descriptor at nothing and return a copy of what it was, None if there is none."""
+def _redirect_stderr() -> int | None:
+    """Redirect standard error to the null device; return a copy of its descriptor, None if there is none."""
     try:
-        saved = os.dup(_STDERR)
+        copy = os.dup(_STDERR)
     except OSError:
         return None
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, _STDERR)
-    os.close(nowhere)
-    return saved
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, _STDERR)
+    os.close(null)
+    return copy

@@ -1,7 +1,7 @@
-"""Foreign files: whatever goes wrong while one is read becomes one `FileError`.
+"""Reading of foreign files: any error becomes one `FileError`.
 
-A file may hold anything, and the libraries that parse it raise what they like: so no reader lists the exceptions that
-it knows. Each parses within `parsing`.
+A file may have any content, and the libraries that parse it raise any exception: so no reader lists exceptions. Each
+parses within `parsing`.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ _LONGEST_REASON = 200
 
 
 @contextmanager
-def parsing(path: str | os.PathLike[str], what: str, rule: str | None = None) -> Iterator[None]:
-    """Turn everything that is raised in a ``with`` block into a `FileError` that names the file.
+def parsing(path: str | os.PathLike[str], kind: str, rule: str | None = None) -> Iterator[None]:
+    """Turn every exception of a ``with`` block into a `FileError` that names the file.
 
-    An interrupt passes, and so does a `FileError`. That the memory does not suffice counts as a fault of the file: its
-    size is what it claims.
+    An interrupt passes, and so do a `FileError` and a warning. A lack of memory counts as a fault of the file, whose
+    header states its size.
 
     Parameters
     ----------
     path : path
         The file that is read.
-    what : str
-        What it should be, such as ``"image"``.
+    kind : str
+        The expected content, such as ``"image"``.
     rule : str or None
-        What the message says instead of that it is not a readable `what`, such as ``"weights must be a safetensors
+        The message's beginning in place of "is not a readable <kind>", such as ``"weights must be a safetensors
         file"``.
 
     Raises
@@ -49,7 +49,7 @@ def parsing(path: str | os.PathLike[str], what: str, rule: str | None = None) ->
     name = repr(str(path))
     try:
         yield
-    except FileError:
+    except (FileError, Warning):  # a warning is one where the filters of `warnings` say so
         raise
     except StereokitError as error:  # a rule of ours that the content breaks
         raise FileError(f"{name}: {error}") from error
@@ -58,16 +58,16 @@ def parsing(path: str | os.PathLike[str], what: str, rule: str | None = None) ->
     except MemoryError as error:
         raise FileError(f"{name} needs more memory than there is") from error
     except RecursionError as error:
-        raise FileError(_refusal(name, what, rule, "it is nested too deeply")) from error
+        raise FileError(_refusal(name, kind, rule, "it is nested too deeply")) from error
     except Exception as error:
         if isinstance(error, OSError) and error.strerror:
             raise FileError(f"cannot read {name}: {error.strerror}") from error
         reason = one_line(str(error))[:_LONGEST_REASON] or type(error).__name__
-        raise FileError(_refusal(name, what, rule, reason)) from error
+        raise FileError(_refusal(name, kind, rule, reason)) from error
 
 
-def _refusal(name: str, what: str, rule: str | None, reason: str) -> str:
-    return f"{rule}, got {name} ({reason})" if rule else f"{name} is not a readable {what} ({reason})"
+def _refusal(name: str, kind: str, rule: str | None, reason: str) -> str:
+    return f"{rule}, got {name} ({reason})" if rule else f"{name} is not a readable {kind} ({reason})"
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -82,14 +82,14 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         return Path(path).read_bytes()
 
 
-def read_text(path: str | os.PathLike[str], what: str = "text file") -> str:
+def read_text(path: str | os.PathLike[str], kind: str = "text file") -> str:
     """Return the text of a file in UTF-8 or, where its first bytes say so, UTF-16; any line end becomes a line feed.
 
     Parameters
     ----------
     path : path
-    what : str
-        What it should be, for the message.
+    kind : str
+        The expected content, for the message.
 
     Raises
     ------
@@ -101,26 +101,26 @@ def read_text(path: str | os.PathLike[str], what: str = "text file") -> str:
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FileError(f"{str(path)!r} is not a text file, or not in UTF-8, so no {what}") from error
+        raise FileError(f"{str(path)!r} is not a text file, or not in UTF-8, so no {kind}") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_json(path: str | os.PathLike[str], what: str) -> Any:
-    """Return what a JSON file says.
+def read_json(path: str | os.PathLike[str], kind: str) -> Any:
+    """Return the content of a JSON file.
 
     Parameters
     ----------
     path : path
-    what : str
-        What it should be, for the message.
+    kind : str
+        The expected content, for the message.
 
     Raises
     ------
     FileError
         If it is missing, cannot be read or is no JSON.
     """
-    text = read_text(path, what)
-    with parsing(path, what):
+    text = read_text(path, kind)
+    with parsing(path, kind):
         return json.loads(text)
 
 
@@ -136,7 +136,7 @@ def read_npy(path: str | os.PathLike[str], data: bytes | None = None) -> NDArray
     Raises
     ------
     FileError
-        If it is missing, cannot be read or holds no array.
+        If it is missing, cannot be read or has no array.
     """
     with parsing(path, "npy file"):
         if data is None:

@@ -1,1 +1,1 @@
-"""What the compiled stages share: compiler flags and vector types."""
+"""Foundations of the compiled stages: compiler flags, vectors, threads, buffers, spans of time."""

@@ -1,6 +1,6 @@
-"""Where compiled kernels are kept from one process to the next: numba's cache, but nothing in it keeps one from work.
+"""Cache of compiled kernels from one process to the next: numba's own, but no fault of it stops a kernel.
 
-They are where numba keeps what it compiles: in the folder that ``NUMBA_CACHE_DIR`` names, beside the source, or in the
+Its files lie where numba puts them: in the folder that ``NUMBA_CACHE_DIR`` names, beside the source, or in the
 user's cache. Where none of these can be written, as in a read-only container, one that has them is read; kernels that
 none has go to a folder of temporary files that is the user's alone, and where that cannot be either, they are compiled
 again in every process. A file of the cache that is damaged (a full disk, a power cut) counts as absent, and is written
@@ -45,8 +45,8 @@ def _temporary_folder() -> Path | None:
             return None
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if not stat.S_ISDIR(found.st_mode) or (user is not None and (found.st_uid != user or found.st_mode & 0o077)):
+        status = folder.lstat()
+        if not stat.S_ISDIR(status.st_mode) or (user is not None and (status.st_uid != user or status.st_mode & 0o077)):
             return None
         tempfile.TemporaryFile(dir=folder).close()
     except OSError:
@@ -55,7 +55,7 @@ def _temporary_folder() -> Path | None:
 
 
 class _TemporaryLocator:
-    """Where numba finds and puts the files of a function if there is no other place for them."""
+    """The last place for the files of a function: a folder of temporary files."""
 
     def __init__(self, function: Any, file: str, folder: Path) -> None:
         self._stamp = hashlib.sha256(Path(file).read_bytes()).hexdigest()
@@ -85,16 +85,16 @@ class _TemporaryLocator:
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        """Return what changes with the source."""
+        """Return a digest of the source."""
         return self._stamp
 
     def get_disambiguator(self) -> str:
-        """Return what tells functions of one name apart."""
+        """Return the line of the function, which differs among functions of one name."""
         return str(self._line)
 
 
 class _ReadableLocator:
-    """Where numba would find the files of a function, in a folder that it could not write to."""
+    """A place that has the files of a function but cannot be written to."""
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> Any:
@@ -114,12 +114,12 @@ class _CheckedFiles(CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = (*CompileResultCacheImpl._locator_classes, _ReadableLocator, _TemporaryLocator)
 
     def reduce(self, cres: Any) -> tuple[bytes, bytes]:
-        """Return what is written to a file."""
+        """Return the content of a file: a digest and the compiled function."""
         content = dumps(super().reduce(cres))
         return hashlib.sha256(content).digest(), content
 
     def rebuild(self, target_context: Any, payload: tuple[bytes, bytes]) -> Any:
-        """Return what was compiled."""
+        """Return the compiled function of a file's content."""
         digest, content = payload
         if hashlib.sha256(content).digest() != digest:
             raise ValueError("damaged file of the cache")
@@ -132,7 +132,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     _impl_class = _CheckedFiles
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what was compiled for a signature, or None."""
+        """Return the compiled function for a signature, or None."""
         try:
             return super().load_overload(sig, target_context)
         except Exception:  # whatever unpickling makes of damaged files
@@ -141,7 +141,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Write what was compiled for a signature."""
+        """Write the compiled function for a signature."""
         try:
             super().save_overload(sig, data)
         except OSError as error:

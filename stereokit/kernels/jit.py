@@ -1,6 +1,6 @@
 """The one home of numba's flags.
 
-Every kernel is compiled on first use for the types that it meets, kept on disk (`stereokit.kernels.cache`), releases
+Every kernel is compiled on first use for the types that it meets, cached on disk (`stereokit.kernels.cache`), releases
 the interpreter lock so that plain threads run it side by side, and divides as numpy does (no zero-division
 exception inside loops). There is no ``fastmath``: results must not depend on the processor. There is no
 ``parallel=True`` either: kernels are serial over a range of rows or columns, and `stereokit.kernels.threads` runs
@@ -48,12 +48,12 @@ def _digest(paths: Iterable[Path]) -> str:
 
 def _imports(path: Path) -> set[Path]:
     """Return the modules of the package that a module imports; a line that names nothing of it adds nothing."""
-    found = set()
+    files: set[Path] = set()
     for module, names in _IMPORT.findall(path.read_bytes()):
         place = _ROOT.joinpath(*module.decode().split(".")[1:])
         inner = [place / name for name in re.findall(r"\w+", names.decode())]
-        found |= {file for each in (place, *inner) for file in (each.with_suffix(".py"), each / "__init__.py")}
-    return {file for file in found if file.is_file()}
+        files |= {file for each in (place, *inner) for file in (each.with_suffix(".py"), each / "__init__.py")}
+    return {file for file in files if file.is_file()}
 
 
 def kernel_sources() -> set[Path]:

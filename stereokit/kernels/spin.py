@@ -3,7 +3,7 @@
 A stage at half size lasts a few hundred microseconds; to hand its tasks out and to wait for them through the
 interpreter's queues and locks takes 50 to 80. Who looks at a word in memory instead sees its change within a
 microsecond. That uses a processor, so it must not last: after a few microseconds the processor is offered to others
-between two looks, and after a few milliseconds the caller is told that nothing came.
+between two looks, and after a few milliseconds the call returns.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _look(typing: Any, words: Any, index: Any) -> Any:
 
 @intrinsic
 def _pause(typing: Any, looks: Any) -> Any:
-    """Wait a moment, longer after many `looks`; on Windows the processor is kept."""
+    """Wait a moment, longer after many `looks`; on Windows it yields the processor to nobody."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def call(name: str, result: Any) -> None:

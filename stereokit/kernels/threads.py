@@ -115,7 +115,7 @@ class Job(Generic[T]):
     Parameters
     ----------
     function, *arguments
-        What is called.
+        Function and its arguments.
     """
 
     def __init__(self, function: Callable[..., T], *arguments: object) -> None:
@@ -137,7 +137,7 @@ class Job(Generic[T]):
                 self._error = error
 
     def result(self) -> T:
-        """Return what the call returns, or raise what it raises; make it here if no worker has begun."""
+        """Return the call's value, or raise its error; make the call here if no worker has begun."""
         try:
             call = self._unclaimed.pop()
         except IndexError:

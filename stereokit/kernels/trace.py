@@ -39,7 +39,7 @@ class span:
     group : str
         One of `GROUPS`.
     name : str
-        What is done.
+        Name of the work.
     """
 
     __slots__ = ("_group", "_name", "_observer")

@@ -1,4 +1,4 @@
-"""Buffers that are kept from one call to the next.
+"""Buffers that live from one call to the next.
 
 A matcher owns a `Pool`. Each call takes a `Workspace` out, and puts it back when it ends well, so that calls from
 several threads never share a buffer and a steady stream of equal frames allocates nothing.
@@ -21,9 +21,9 @@ __all__ = ["Pool", "Workspace"]
 T = TypeVar("T")
 
 _MOST_FREE = 4
-"""What a pool keeps for later calls at the same time."""
+"""Free objects of a pool at the same time; more are dropped."""
 _LOANS_UNUSED = 8
-"""Loans after which a pool lets go of what none of them needed."""
+"""Loans after which a pool drops an object that none of them needed."""
 
 
 class Workspace:
@@ -31,7 +31,7 @@ class Workspace:
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray[Any, Any]] = {}
-        self._made: dict[str, tuple[Hashable, Any]] = {}
+        self._cached: dict[str, tuple[Hashable, Any]] = {}
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray[Any, Any]:
         """Return the array called `name`, C-contiguous and 64-byte aligned; its content is whatever it was."""
@@ -43,11 +43,11 @@ class Workspace:
             array = self._arrays[name] = aligned(shape, dtype)
         return array
 
-    def once(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
-        """Return what `make` returned when `name` was last asked for, if that was with the same `key`."""
-        entry = self._made.get(name)
+    def cached(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the value called `name`; `make` makes it when it is new, or its `key` has changed."""
+        entry = self._cached.get(name)
         if entry is None or entry[0] != key:
-            entry = self._made[name] = key, make()
+            entry = self._cached[name] = key, make()
         value: T = entry[1]
         return value
 
@@ -58,7 +58,7 @@ class Workspace:
 
 
 class Pool(Generic[T]):
-    """What calls borrow, made when nothing is free: workspaces of a matcher, queues of a GPU, requests of a network.
+    """Objects that calls borrow, new ones when none is free: workspaces, queues of a GPU, requests of a network.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Pool(Generic[T]):
     def __init__(self, make: Callable[[], T]) -> None:
         self._make = make
         # Pairs of one and the number of loans when it came back, the latest last. The operations of a deque need no
-        # lock, which a fork could leave held.
+        # lock, which a fork could leave locked.
         self._free: deque[tuple[T, int]] = deque()
         self._loans = 0
 
@@ -77,7 +77,7 @@ class Pool(Generic[T]):
     def take(self) -> Iterator[T]:
         """Lend one for the length of a ``with`` block.
 
-        What was lent to a block that raises is never lent again: a thread that was not waited for may still write to
+        An object is never lent again after a block that raises: a thread that was not waited for may still write to
         it.
         """
         try:
@@ -90,12 +90,12 @@ class Pool(Generic[T]):
         self._trim()
 
     def _trim(self) -> None:
-        """Let go of what a burst of calls has left: all but a few, and what nobody has needed for some calls."""
+        """Drop the leftovers of a burst of calls: all but a few objects, and those that no call has needed lately."""
         with suppress(IndexError):  # others may take meanwhile
             while len(self._free) > _MOST_FREE or self._loans - self._free[0][1] > _LOANS_UNUSED:
                 self._free.popleft()
 
     @property
     def free(self) -> list[T]:
-        """What waits to be lent."""
+        """Objects that nobody has borrowed."""
         return [one for one, _ in self._free]

@@ -1,8 +1,8 @@
-"""From windows to bands of full width, and what is done to a band as a whole: filling and the median.
+"""Assembly of windows to bands of full width, and the steps that need a whole band: filling and the median.
 
-Filling looks along a row for whatever is there, however far, so that a window alone would fill with other values
-than the whole image; it waits until the row is complete, and the median after it. At half size both come before the
-refiner, and stay within the window.
+Filling takes the nearest value of a row, however far it lies. A window alone would fill with other values than the
+whole image, so filling waits until the row is complete, and the median comes after it. At half size both come before
+the refiner, and stay within the window.
 """
 
 from __future__ import annotations
@@ -13,51 +13,62 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.checks import same_pixels
-from stereokit.images.intensity import Tone
-from stereokit.large.plan import Cut, Plan
-from stereokit.large.sources import Source
-from stereokit.large.tones import Ranges, read_pair
+from stereokit.checks import PairWatch, density_warnings, same_pixels, view_warnings
+from stereokit.images.evidence import joined
+from stereokit.images.intensity import IntensityMapping
+from stereokit.large.intensity import MaskedSource, Ranges, read_pair
+from stereokit.large.plan import Plan, Span
 from stereokit.matching import Matcher
+from stereokit.pipeline import with_blank
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows
 
-__all__ = ["Bands"]
+__all__ = ["BandAssembler"]
+
+_OF_WINDOWS = ("only", "no pixel", "left and right hold the same pixels")
+"""Beginnings of warnings that a window alone, of nothing but water, may have."""
 
 
-class Bands:
-    """The map in bands, top to bottom.
+class BandAssembler:
+    """An iterator over the map in bands, top to bottom.
 
     Parameters
     ----------
     matcher : Matcher
-    sources : (Source, Source)
-    tone : Tone
+    sources : (MaskedSource, MaskedSource)
+    mapping : IntensityMapping
     ranges : ((int, int), (int, int)) or None
-        See `stereokit.large.tones.find_ranges`.
+        See `stereokit.large.intensity.find_ranges`.
     windows : Plan
     progress : callable or None
-        Called with the number of windows done and of all.
+        Called with the number of matched windows and of all windows.
 
     Attributes
     ----------
     measured : int
         Pixels so far that were measured.
-    same : bool
-        Whether both views were the same so far.
+    views_equal : bool
+        Whether both views have equal pixels so far.
     """
 
     def __init__(
-        self, matcher: Matcher, sources: tuple[Source, Source], tone: Tone, ranges: Ranges | None, windows: Plan,
+        self,
+        matcher: Matcher,
+        sources: tuple[MaskedSource, MaskedSource],
+        mapping: IntensityMapping,
+        ranges: Ranges | None,
+        windows: Plan,
         progress: Callable[[int, int], object] | None,
-    ) -> None:  # fmt: skip
-        self.measured, self.same = 0, True
-        self._wanted, self._sources, self._tone, self._ranges = matcher, sources, tone, ranges
+    ) -> None:
+        self.measured, self.views_equal = 0, True
+        self._usable, self._watch, self._lines = 0, PairWatch(), list[str]()
+        self._image_matcher, self._sources, self._mapping, self._ranges = matcher, sources, mapping, ranges
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
-        self._matcher = _for_windows(matcher, (self._height, self._width), windows.window)
+        self._window_matcher = _window_matcher(matcher, (self._height, self._width), windows.window)
+        self._range = matcher.min_disparity, matcher.max_disparity
         self._halo = matcher.settings.median // 2 if matcher.refiner is None else 0
-        self._last: NDArray[np.float32] | None = None  # row that a band without any valid pixel is filled from
+        self._last_row: NDArray[np.float32] | None = None  # row that a band without any valid pixel is filled from
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
         """Yield (rows, W) float32, pixels, NaN where invalid."""
@@ -67,48 +78,75 @@ class Bands:
             top = max(row.first - self._halo, row.start)
             bottom = min(row.last + self._halo, row.stop)
             band = np.empty((bottom - top, self._width), np.float32)
+            empty = np.zeros(band.shape, np.bool_)
             for column in self._windows.columns:
-                self._match(row, column, top, band)
+                self._match(row, column, top, band, empty)
                 done += 1
                 if self._progress is not None:
                     self._progress(done, total)
             band = self._finished(band)
+            band[empty] = np.nan
             yield band[row.first - top : row.last - top]
-            del band
+            del band, empty
 
-    def _match(self, row: Cut, column: Cut, top: int, band: NDArray[np.float32]) -> None:
-        """Match one window and put what is kept of it into a band that begins at row `top`."""
+    def _match(
+        self, row: Span, column: Span, top: int, band: NDArray[np.float32], empty: NDArray[np.bool_]
+    ) -> None:  # fmt: skip
+        """Match one window and copy its inner part into a band that begins at row `top`, and where that stays empty."""
         window = row.start, row.stop, column.start, column.stop
-        pair = read_pair(*self._sources, self._tone, window, self._ranges)
-        self.same = self.same and same_pixels(pair.left, pair.right)
-        found = self._matcher.match_gray(pair, self._matcher.threads)
-        kept = slice(column.first - column.start, column.last - column.start)
+        pair = read_pair(*self._sources, self._mapping, window, self._ranges)
+        self.views_equal = self.views_equal and same_pixels(pair.left, pair.right)
+        pair = with_blank(pair, self._window_matcher.settings)
+        result = self._window_matcher.match_gray(pair, self._window_matcher.threads, keeps_blank=True)
+        columns = slice(column.first - column.start, column.last - column.start)
         rows = slice(top - row.start, top - row.start + len(band))
-        band[:, column.first : column.last] = found.disparity[rows, kept]
-        self.measured += int(np.count_nonzero(found.valid[row.first - row.start : row.last - row.start, kept]))
+        band[:, column.first : column.last] = result.disparity[rows, columns]
+        filled = self._image_matcher.settings.fill is not None
+        without = joined(pair.left_bad, None if filled else pair.left_blank)
+        if without is not None:
+            empty[:, column.first : column.last] = without[rows, columns]
+        inner = np.s_[row.first - row.start : row.last - row.start, columns]
+        self._usable += pair.left[inner].size
+        if pair.left_bad is not None:
+            self._usable -= int(np.count_nonzero(pair.left_bad[inner]))
+        if not self._lines:
+            self._lines = self._watch.warnings(pair, result, *self._range)
+        self.measured += int(np.count_nonzero(result.valid[inner]))
+
+    def warnings(self) -> list[str]:
+        """Return the warnings about the pair and its map, a line each, when all windows are matched."""
+        if self.views_equal:
+            return view_warnings(True)
+        if not self._usable:
+            return ["no pixel is usable: mask, no-data value, alpha or black borders exclude them all"]
+        density = density_warnings(self.measured / self._usable, *self._range)
+        closer = [line for line in self._lines if not line.startswith(_OF_WINDOWS)]
+        return (closer or density) if density or any(line.startswith("rows") for line in closer) else []
 
     def _finished(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
-        settings = self._wanted.settings
+        settings = self._image_matcher.settings
         if settings.refiner is not None:
             return band
-        filled = settings.fill is not None
-        if filled:
+        fills = settings.fill is not None
+        if fills:
             if fill_rows(band, 0, len(band), settings.fill == "nearest") and not fill_empty_rows(band):
-                band[:] = settings.levels.minimum if self._last is None else self._last
-            self._last = band[-1].copy()
+                band[:] = settings.levels.minimum if self._last_row is None else self._last_row
+            self._last_row = band[-1].copy()
         if settings.median == 0:
             return band
         out = np.empty_like(band)
-        median_rows(band, settings.median, 0, len(band), out, dense=filled)
+        median_rows(band, settings.median, 0, len(band), out, dense=fills)
         return out
 
 
-def _for_windows(matcher: Matcher, image: tuple[int, int], window: tuple[int, int]) -> Matcher:
-    """Return a matcher whose largest speckle has as many pixels as in the whole image, and that leaves filling."""
+def _window_matcher(matcher: Matcher, image: tuple[int, int], window: tuple[int, int]) -> Matcher:
+    """Return the matcher of the windows: its largest speckle has as many pixels as that of the image, and no fill."""
     step = matcher.settings.step
-    whole, part = (-(-height // step) * -(-width // step) for height, width in (image, window))
+    image_pixels, window_pixels = (-(-height // step) * -(-width // step) for height, width in (image, window))
     speckle = matcher.settings.speckle
-    changes: dict[str, Any] = {"speckle": min(1.0, (int(speckle * whole) + 0.5) / part)} if speckle else {}
+    changes: dict[str, Any] = (
+        {"speckle": min(1.0, (int(speckle * image_pixels) + 0.5) / window_pixels)} if speckle else {}
+    )
     if matcher.refiner is None:
         changes.update(fill=None, median=0)
     return matcher.replaced(**changes)

@@ -1,11 +1,11 @@
 """Match images that do not fit in memory: overlapping windows, one at a time, as large as a bound of memory allows.
 
 Semi-global costs reach across the whole image in theory, and the domain transform's filter fades but does not end;
-in practice both forget within some tens of pixels what came before. So a window is matched with a margin, `overlap`,
-that is then dropped; what remains differs from the map of the whole image in few pixels, the fewer the larger the
-margin is (`OVERLAP` has the figures). What is decided from whole images (the range of 16-bit and floating-point
-values, the largest region that counts as a speckle) is decided so here too, and gaps are filled along whole rows; at
-half size, where a refiner wants a filled map, filling looks no further than the window.
+in practice the influence of a pixel ends within some tens of pixels. So a window is matched with a margin, `overlap`,
+that is then dropped. The inner part differs from the map of the whole image in few pixels, the fewer the larger the
+margin is (`OVERLAP` has the figures). Decisions from whole images (the range of 16-bit and floating-point values, the
+largest region that counts as a speckle) are made from whole images here too, and gaps are filled along whole rows. At
+half size, where a refiner needs a filled map, filling stays within the window.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from typing import Any
 
 import numpy as np
 
-from stereokit.checks import doubts_about_density, doubts_about_views
-from stereokit.errors import OptionError
+from stereokit.errors import InputError, OptionError
 from stereokit.images.check import check_integer
+from stereokit.images.evidence import checked_mask
 from stereokit.images.gray import check_same
-from stereokit.images.intensity import Tone
-from stereokit.io.images import doubt_orientations
-from stereokit.large.bands import Bands
+from stereokit.images.intensity import IntensityMapping
+from stereokit.io.images import check_orientations
+from stereokit.large.bands import BandAssembler
+from stereokit.large.intensity import BLOCK_NBYTES, MaskedSource, Ranges, find_ranges, intensity_mapping
 from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes
 from stereokit.large.output import check_large_output, write_bands
 from stereokit.large.plan import Plan, plan
 from stereokit.large.sources import Source, open_source
-from stereokit.large.tones import BLOCK_NBYTES, Ranges, find_ranges, tone_of
 from stereokit.matching import Matcher
 from stereokit.notices import PairWarning, warn
 
 __all__ = ["OVERLAP", "LargeResult", "match_large"]
 
 OVERLAP = 96
-"""Margin of windows where nobody says otherwise, pixels.
+"""Default margin of the windows, pixels.
 
 One cut through 1242x1000 synthetic streets (three) and KITTI 2015 pairs (eight), 128 disparities, default options:
 pixels that differ from the map of the whole image at all, and by more than a pixel, for each pixel of the cut's
@@ -60,12 +60,12 @@ only what comes from afar decides, have more.
 """
 
 _RESERVE_NBYTES = 6 * BLOCK_NBYTES + 2**24
-"""For blocks on their way to grey, and what the interpreter and the system take meanwhile."""
+"""Memory for blocks before their conversion to grey, and for the interpreter and the system meanwhile."""
 
 
 @dataclass(frozen=True)
 class LargeResult:
-    """What was written.
+    """The map file of `match_large`, and how it was matched.
 
     Attributes
     ----------
@@ -104,6 +104,8 @@ def match_large(
     memory: int | float | str | None = None,
     overlap: int = OVERLAP,
     progress: Callable[[int, int], object] | None = None,
+    mask: Any = None,
+    right_mask: Any = None,
     **options: Any,
 ) -> LargeResult:
     """Match a rectified pair window by window and write the left view's disparity map as it grows.
@@ -112,19 +114,21 @@ def match_large(
     ----------
     left, right : path or array
         Images of one size and type, as `stereokit.match` takes them. ``.npy`` files are mapped and TIFF files decoded
-        tile by tile (``stereokit[large]``); other files are read whole, and count in `memory`.
+        tile by tile (``stereokit[tiff]``); other files are read whole, and count in `memory`.
     output : path
-        ``.npy``, or ``.tiff`` in tiles of 256 (``stereokit[large]``). It appears when it is complete.
+        ``.npy``, or ``.tiff`` in tiles of 256 (``stereokit[tiff]``). It appears when it is complete.
     method : str
         ``"cost+aggregation"`` or S1 to S4.
     memory : int, str or None
-        Bound of what the whole process occupies, bytes or such as ``"2GB"``; None is what it occupies now and half
-        of what is free.
+        Upper bound of the memory of the whole process, bytes or text such as ``"2GB"``; None is its present memory
+        and half of the free one.
     overlap : int
-        Margin around what is kept of a window, pixels; in the direction of disparity, as many more as there are
+        Margin around the inner part of a window, pixels; in the direction of disparity, as many more as there are
         disparities.
     progress : callable or None
-        Called with the number of windows done and of all.
+        Called with the number of matched windows and of all windows.
+    mask, right_mask : path or (H, W) bool, optional
+        Usable pixels of the left, and of the right image: True, or not 0 in a file, which is read as the images are.
     **options
         Those of `Matcher`, but ``right`` and ``confidence``.
 
@@ -152,46 +156,73 @@ def match_large(
     limit = None if memory is None else parse_memory(memory)
     sources = open_source("left", left), open_source("right", right)
     check_same(*sources)
-    doubt_orientations(sources[0].orientation, sources[1].orientation)
-    tone = tone_of(*sources, matcher.settings.nodata)
+    check_orientations(sources[0].orientation, sources[1].orientation)
     height, width = sources[0].shape[:2]
-    windows = _plan(matcher, sources, tone, overlap, limit, target)
+    views = (
+        MaskedSource(sources[0], _mask_source("mask", mask, (height, width))),
+        MaskedSource(sources[1], _mask_source("right_mask", right_mask, (height, width))),
+    )
+    mapping = intensity_mapping(*views, matcher.settings.nodata)
+    windows = _plan(matcher, views, mapping, overlap, limit, target)
     ranges: Ranges | None = None
     if getattr(matcher.cost, "needs_ranges", False):
-        ranges = find_ranges(*sources, tone, matcher.settings.step, matcher.settings.smooth, matcher.threads)
-    bands = Bands(matcher, sources, tone, ranges, windows, progress)
-    write_bands(target, height, width, bands)
-    total = len(windows.rows) * len(windows.columns)
-    density = bands.measured / (height * width)
-    views = doubts_about_views(bands.same)
-    for line in views or doubts_about_density(density, matcher.min_disparity, matcher.max_disparity):
+        ranges = find_ranges(*views, mapping, matcher.settings.step, matcher.settings.smooth, matcher.threads)
+    assembler = BandAssembler(matcher, views, mapping, ranges, windows, progress)
+    write_bands(target, height, width, assembler)
+    count = len(windows.rows) * len(windows.columns)
+    density = assembler.measured / (height * width)
+    for line in assembler.warnings():
         warn(line, PairWarning)
-    return LargeResult(target, height, width, windows.window, total, overlap, density, matcher)
+    return LargeResult(target, height, width, windows.window, count, overlap, density, matcher)
+
+
+def _mask_source(name: str, mask: Any, shape: tuple[int, int]) -> Source | None:
+    """Return a mask as the source of its windows, None if there is none."""
+    if mask is None:
+        return None
+    if not isinstance(mask, (str, os.PathLike)):
+        mask = checked_mask(name, mask, shape)
+    source = open_source(name, mask)
+    if source.shape != shape:
+        raise InputError(f"{name} must have the size of the images, {shape}, got {source.shape}")
+    return source
 
 
 def _plan(
-    matcher: Matcher, sources: tuple[Source, Source], tone: Tone, overlap: int, limit: int | None, target: Path
+    matcher: Matcher,
+    views: tuple[MaskedSource, MaskedSource],
+    mapping: IntensityMapping,
+    overlap: int,
+    limit: int | None,
+    target: Path,
 ) -> Plan:
-    height, width = sources[0].shape[:2]
-    size = tone.kind.itemsize
-    masked = tone.nodata is not None or sources[0].dtype != np.uint8 or any(s.shape[2:] == (4,) for s in sources)
-    pixel = 2 * size + (size > 1) + 2 * masked + 5  # both images, guide, masks, the map
-    pixel += getattr(matcher.cost, "bytes_per_pixel", 0)
-    pixel += _refiner_nbytes(matcher)
-    band = 4 * width * (2 if target.suffix.lower() == ".npy" else 4)  # before and after the median, and as tiles
+    height, width = views[0].shape[:2]
+    sources = [view.image for view in views]
+    masks = [view.mask for view in views if view.mask is not None]
+    size = mapping.kind.itemsize
+    has_masks = (
+        bool(masks)
+        or mapping.nodata is not None
+        or sources[0].dtype != np.uint8
+        or any(source.shape[2:] == (4,) for source in sources)
+    )
+    pixel_nbytes = 2 * size + (size > 1) + 2 * has_masks + 5  # both images, guide, masks, the map
+    pixel_nbytes += getattr(matcher.cost, "bytes_per_pixel", 0)
+    pixel_nbytes += _refiner_nbytes(matcher)
+    row_nbytes = 4 * width * (2 if target.suffix.lower() == ".npy" else 4)  # before and after the median, and as tiles
 
     def needed(rows: int, columns: int) -> float:
-        return matcher.nbytes(rows, columns, tone.kind) + pixel * rows * columns + band * rows
+        return matcher.nbytes(rows, columns, mapping.kind) + pixel_nbytes * rows * columns + row_nbytes * rows
 
-    used = resident_nbytes()
-    limit = used + free_nbytes() // 2 if limit is None else limit
-    left_over = limit - used - _RESERVE_NBYTES - max(source.piece_nbytes for source in sources)
+    occupied = resident_nbytes()
+    limit = occupied + free_nbytes() // 2 if limit is None else limit
+    window_memory = limit - occupied - _RESERVE_NBYTES - max(source.piece_nbytes for source in [*sources, *masks])
     reach_x = overlap + max(abs(matcher.min_disparity), abs(matcher.max_disparity))
-    return plan(height, width, overlap, reach_x, left_over, needed)
+    return plan(height, width, overlap, reach_x, window_memory, needed)
 
 
 def _refiner_nbytes(matcher: Matcher) -> int:
-    """Return the bytes a pixel that a refiner takes beside the matcher's buffers; measured, see the tests."""
+    """Return the bytes per pixel of a refiner, without the matcher's buffers; measured, see the tests."""
     if matcher.refiner is None:
         return 0
     return 12 if matcher.refiner == "linear" else 200

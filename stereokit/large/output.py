@@ -1,6 +1,6 @@
-"""Maps that are written band by band: ``.npy``, and tiled TIFF, which needs tifffile.
+"""Map files, written band by band: ``.npy``, and tiled TIFF, which needs tifffile.
 
-Either goes to a temporary name beside the target, is renamed when it is complete, and removed if anything fails.
+The file has a temporary name in the target's folder; it is renamed when it is complete, and removed after an error.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ def check_large_output(path: str | os.PathLike[str]) -> Path:
         try:
             import tifffile  # noqa: F401
         except ModuleNotFoundError as error:
-            raise StereokitError("output: tiled TIFF needs tifffile: pip install 'stereokit[large]'") from error
+            raise StereokitError("output: tiled TIFF needs tifffile: pip install 'stereokit[tiff]'") from error
     return target
 
 
 def write_bands(path: Path, height: int, width: int, bands: Iterable[NDArray[np.float32]]) -> None:
-    """Write a map that comes in bands of full width from top to bottom; one is held at a time.
+    """Write a map that comes in bands of full width from top to bottom, one band in memory at a time.
 
     Parameters
     ----------
@@ -81,16 +81,16 @@ def _write_tiff(path: Path, height: int, width: int, bands: Iterable[NDArray[np.
 
 def _tiles(bands: Iterable[NDArray[np.float32]], width: int) -> Iterator[NDArray[np.float32]]:
     """Yield the tiles of a map, row by row of tiles; those at the lower and right side are filled up with zeros."""
-    held: list[NDArray[np.float32]] = []
+    pending: list[NDArray[np.float32]] = []
     for band in bands:
-        held.append(band)
-        ready = np.concatenate(held)
-        whole = len(ready) // TILE * TILE
-        for top in range(0, whole, TILE):
-            yield from _row_of_tiles(ready[top : top + TILE], width)
-        held = [ready[whole:].copy()]
-    if held and len(held[0]):
-        yield from _row_of_tiles(held[0], width)
+        pending.append(band)
+        rows = np.concatenate(pending)
+        row_count = len(rows) // TILE * TILE
+        for top in range(0, row_count, TILE):
+            yield from _row_of_tiles(rows[top : top + TILE], width)
+        pending = [rows[row_count:].copy()]
+    if pending and len(pending[0]):
+        yield from _row_of_tiles(pending[0], width)
 
 
 def _row_of_tiles(rows: NDArray[np.float32], width: int) -> Iterator[NDArray[np.float32]]:

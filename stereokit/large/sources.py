@@ -1,8 +1,8 @@
-"""Images that are read a window at a time: arrays, memory-mapped ``.npy``, and TIFF tile by tile.
+"""Image sources that are read a window at a time: arrays, memory-mapped ``.npy``, and TIFF tile by tile.
 
-Of a TIFF only the tiles (or strips) that a window touches are decoded. Any other image file is read whole and held, and
-so is a TIFF whose tiles are not what is shown: a palette, planes, inverted greys.
-A mapped file is mapped anew for each window: pages of a mapping that lives on count as memory of the process.
+Of a TIFF only the tiles (or strips) that a window touches are decoded. Any other image file is read whole and stays in
+memory, and so does a TIFF whose tiles are not its pixels: a palette, planes, inverted greys. A mapped file is mapped
+anew for each window, since the pages of an open mapping count as memory of the process.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class Source(Protocol):
     dtype : numpy.dtype
         uint8, uint16, float32 or float64.
     row_step : int
-        Rows that are read together at no further cost: the height of a tile.
+        Rows that one read decodes together: the height of a tile.
     piece_nbytes : int
-        Bytes that reading one piece takes beside the window.
-    held_nbytes : int
-        Bytes that the source itself holds in memory.
+        Further bytes while one tile is read, without the window itself.
+    resident_nbytes : int
+        Bytes of the source's own memory.
     orientation : int
         The tag that was applied, 1 to 8.
     """
@@ -48,7 +48,7 @@ class Source(Protocol):
     dtype: np.dtype[Any]
     row_step: int
     piece_nbytes: int
-    held_nbytes: int
+    resident_nbytes: int
     orientation: int
 
     def read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
@@ -62,7 +62,7 @@ def open_source(name: str, image: Any) -> Source:
     Parameters
     ----------
     name : str
-        What messages call the argument.
+        The argument's name in messages.
     image : (H, W) or (H, W, 3) array, or path
         An npy file is mapped, of a TIFF tiles are decoded as needed, other files are read whole.
 
@@ -85,9 +85,9 @@ def open_source(name: str, image: Any) -> Source:
     page = _tiled(name, path) if start.startswith(TIFF_STARTS) else None
     if page is not None:
         return _Tiff(name, path, page)
-    whole, orientation = read_oriented(path)
-    whole = checked_image(name, whole)
-    return _Array(whole, whole.nbytes, orientation)
+    array, orientation = read_oriented(path, alpha=True)
+    array = checked_image(name, array)
+    return _Array(array, array.nbytes, orientation)
 
 
 def _checked(name: str, shape: tuple[int, ...], dtype: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -99,8 +99,8 @@ def _checked(name: str, shape: tuple[int, ...], dtype: Any) -> tuple[tuple[int, 
 class _Array:
     row_step, piece_nbytes = 1, 0
 
-    def __init__(self, array: NDArray[Any], held_nbytes: int, orientation: int = UPRIGHT) -> None:
-        self.shape, self.dtype, self.held_nbytes = array.shape, array.dtype, held_nbytes
+    def __init__(self, array: NDArray[Any], resident_nbytes: int, orientation: int = UPRIGHT) -> None:
+        self.shape, self.dtype, self.resident_nbytes = array.shape, array.dtype, resident_nbytes
         self.orientation = orientation
         self._array = array
 
@@ -109,7 +109,7 @@ class _Array:
 
 
 class _Mapped:
-    row_step, piece_nbytes, held_nbytes, orientation = 1, 0, 0, UPRIGHT
+    row_step, piece_nbytes, resident_nbytes, orientation = 1, 0, 0, UPRIGHT
 
     def __init__(self, name: str, path: Path) -> None:
         self._path = path
@@ -128,7 +128,7 @@ def _tiled(name: str, path: Path) -> Any:
         import tifffile
     except ModuleNotFoundError as error:
         raise StereokitError(
-            f"{name}: windows of TIFF need tifffile, which is not installed: pip install 'stereokit[large]'"
+            f"{name}: windows of TIFF need tifffile, which is not installed: pip install 'stereokit[tiff]'"
         ) from error
     with parsing(path, "TIFF"), tifffile.TiffFile(path) as file:
         page = open_tiff(path, file)
@@ -136,7 +136,7 @@ def _tiled(name: str, path: Path) -> Any:
 
 
 class _Tiff:
-    held_nbytes = 0
+    resident_nbytes = 0
 
     def __init__(self, name: str, path: Path, page: Any) -> None:
         self._path, self._page = path, page
@@ -165,21 +165,21 @@ class _Tiff:
 
     def _read(self, y0: int, y1: int, x0: int, x1: int) -> NDArray[Any]:
         out = np.zeros((y1 - y0, x1 - x0, *self.shape[2:]), self.dtype)
-        page, (high, wide) = self._page, self._tile
-        across = -(-self._stored[1] // wide)
+        page, (tile_height, tile_width) = self._page, self._tile
+        tiles_per_row = -(-self._stored[1] // tile_width)
         with self._path.open("rb") as file:
-            for down in range(y0 // high, -(-y1 // high)):
-                for along in range(x0 // wide, -(-x1 // wide)):
-                    index = down * across + along
+            for tile_row in range(y0 // tile_height, -(-y1 // tile_height)):
+                for tile_column in range(x0 // tile_width, -(-x1 // tile_width)):
+                    index = tile_row * tiles_per_row + tile_column
                     file.seek(page.dataoffsets[index])
                     stored = file.read(page.databytecounts[index])
                     decoded = page.decode(stored, index, jpegtables=page.jpegtables)[0] if stored else None
                     if decoded is not None:  # None is a tile that was never written: zeros
-                        self._place(decoded[0], down * high, along * wide, out, y0, x0)
+                        self._place(decoded[0], tile_row * tile_height, tile_column * tile_width, out, y0, x0)
         return out
 
     def _place(self, tile: NDArray[Any], top: int, start: int, out: NDArray[Any], y0: int, x0: int) -> None:
-        """Copy what a tile, (h, w, samples) from row `top` and column `start`, has of the window `out`."""
+        """Copy the pixels that a tile, (h, w, samples) from row `top` and column `start`, shares with window `out`."""
         first_y, last_y = max(top, y0), min(top + tile.shape[0], y0 + out.shape[0])
         first_x, last_x = max(start, x0), min(start + tile.shape[1], x0 + out.shape[1])
         part = tile[first_y - top : last_y - top, first_x - start : last_x - start]

@@ -1,6 +1,6 @@
-"""All of post-processing in place, for `stereokit.Matcher`: what the public functions do, in bands, without copies.
+"""All of post-processing in place, for `stereokit.Matcher`: the public functions in bands, without copies.
 
-Single matching phase, then speckles, then filling, then the median. What stays within a row or a band is done for a
+Single matching phase, then speckles, then filling, then the median. Work within a row or a band is done for a
 band by one thread while the band is in its cache; threads wait for each other only where regions cross from band to
 band and before the median, which looks over a band's edge.
 """
@@ -21,12 +21,12 @@ from stereokit.postprocess.median import median_rows
 from stereokit.postprocess.smp import resolve_rows
 from stereokit.postprocess.speckle import erase, find_regions, join_rows
 
-__all__ = ["Chain", "post_process"]
+__all__ = ["PostProcessing", "post_process"]
 
 
 @dataclass(frozen=True)
-class Chain:
-    """What is to be done: the options of `stereokit.Matcher`, checked there.
+class PostProcessing:
+    """Options of the post-processing, checked by `stereokit.settings.MatchSettings`.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Chain:
         Rule of filling.
     median : {0, 3, 5}
         Side of the window.
-    nothing : float
+    empty_value : float
         Disparity of a filled map in which no pixel was valid.
     """
 
@@ -46,14 +46,14 @@ class Chain:
     speckle: int
     fill: str | None
     median: int
-    nothing: float
+    empty_value: float
 
 
 def post_process(
-    disparity: NDArray[np.float32], cost: NDArray[Any], bad: NDArray[np.bool_] | None, chain: Chain,
+    disparity: NDArray[np.float32], cost: NDArray[Any], bad: NDArray[np.bool_] | None, steps: PostProcessing,
     workspace: Workspace, threads: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:  # fmt: skip
-    """Return the finished map and which of its pixels were measured, both new.
+    """Return the finished map and the mask of its measured pixels, both new.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def post_process(
         Aggregated cost of each pixel's match.
     bad : (H, W) bool or None
         Pixels without evidence.
-    chain : Chain
-        What to do.
+    steps : PostProcessing
+        Options.
     workspace : Workspace
         Buffers.
     threads : int
@@ -75,18 +75,18 @@ def post_process(
     flat = disparity.reshape(-1)
     valid = np.empty(disparity.shape, np.bool_)
     owners = workspace.array("smp.owners", (len(parts), width), np.int32)
-    size = flat.size if chain.speckle else 0
+    size = flat.size if steps.speckle else 0
     label, parent, count = (workspace.array(f"speckle.{name}", size, np.int32) for name in ("label", "parent", "count"))
     limit = np.float32(1)
     out = np.empty_like(disparity)
-    incomplete: list[int] = []  # bands with rows that have nothing to be filled from
+    incomplete: list[int] = []  # bands with rows that have no pixel to be filled from
 
     def match(k: int, y0: int, y1: int) -> None:
         if bad is not None:
             disparity[y0:y1][bad[y0:y1]] = np.nan
-        if chain.smp:
+        if steps.smp:
             resolve_rows(disparity, cost, y0, y1, owners[k])
-        if chain.speckle:
+        if steps.speckle:
             find_regions(flat, width, y0, y1, limit, label, parent, count)
 
     def join() -> None:
@@ -94,22 +94,22 @@ def post_process(
             join_rows(flat, width, y0, limit, label, parent, count)
 
     def clean(y0: int, y1: int) -> None:
-        if chain.speckle:
-            erase(flat, y0 * width, y1 * width, chain.speckle, label, parent, count)
+        if steps.speckle:
+            erase(flat, y0 * width, y1 * width, steps.speckle, label, parent, count)
         np.equal(disparity[y0:y1], disparity[y0:y1], out=valid[y0:y1])  # NaN is not
-        if chain.fill is not None and fill_rows(disparity, y0, y1, chain.fill == "nearest"):
+        if steps.fill is not None and fill_rows(disparity, y0, y1, steps.fill == "nearest"):
             incomplete.append(y0)
 
     def smooth_rows(k: int, y0: int, y1: int) -> None:
         if incomplete:
             return
-        if chain.median:
-            median_rows(disparity, chain.median, y0, y1, out, workspace, chain.fill is not None, k)
+        if steps.median:
+            median_rows(disparity, steps.median, y0, y1, out, workspace, steps.fill is not None, k)
         else:
             out[y0:y1] = disparity[y0:y1]
 
     stages: list[list[Any]] = [[partial(match, k, y0, y1) for k, (y0, y1) in enumerate(parts)]]
-    if chain.speckle and len(parts) > 1:
+    if steps.speckle and len(parts) > 1:
         stages.append([join])
     stages.append([partial(clean, y0, y1) for y0, y1 in parts])
     stages.append([partial(smooth_rows, k, y0, y1) for k, (y0, y1) in enumerate(parts)])
@@ -117,6 +117,6 @@ def post_process(
     if incomplete:  # rare: rows without any valid pixel take those of others
         incomplete.clear()
         if not fill_empty_rows(disparity):
-            disparity[:] = chain.nothing
+            disparity[:] = steps.empty_value
         run_stages(stages[-1:], threads)
     return out, valid

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stereokit.cuda.kernel import Queue, array, blocks_for, cuda, f32, kernel, u8, u32
-from stereokit.postprocess.chain import Chain
+from stereokit.postprocess.chain import PostProcessing
 from stereokit.postprocess.fill_cuda import fill
 from stereokit.postprocess.median_cuda import median
 from stereokit.postprocess.smp_cuda import resolve
@@ -33,22 +33,22 @@ def raise_to(disparity, low, pixels):  # type: ignore[no-untyped-def]
 
 
 def post_process(
-    queue: Queue, disparity: Any, cost: Any, bad: Any, chain: Chain, shape: tuple[int, int]
+    queue: Queue, disparity: Any, cost: Any, bad: Any, chain: PostProcessing, shape: tuple[int, int]
 ) -> tuple[Any, Any]:
     """Return the finished map and which of its pixels were measured, both on the device; nothing is waited for.
 
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
         As selected; overwritten, and returned where there is no median.
     cost : (H * W,) uint16 or float32
         Aggregated cost of each pixel's match.
     bad : (H * W,) uint8 or None
         1 where a pixel has no evidence.
-    chain : Chain
-        What to do.
+    chain : PostProcessing
+        Options.
     shape : (int, int)
         Height and width, pixels.
 
@@ -64,7 +64,7 @@ def post_process(
         resolve(queue, disparity, cost, shape)
     if chain.speckle:
         remove(queue, disparity, chain.speckle, shape)
-    valid = fill(queue, disparity, chain.fill, chain.nothing, shape)
+    valid = fill(queue, disparity, chain.fill, chain.empty_value, shape)
     if chain.median:
         disparity = median(queue, disparity, chain.median, shape)
     return disparity, valid

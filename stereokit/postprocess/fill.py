@@ -30,7 +30,7 @@ def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: i
     ----------
     disparity : (H, W) float32, pixels, NaN where invalid
     mode : {"background", "nearest"}
-        Which end of a gap fills it.
+        Rule of filling.
     threads : int
         Threads to use; the result does not depend on it.
 
@@ -59,7 +59,7 @@ def fill(disparity: NDArray[np.float32], mode: str = "background", *, threads: i
 
 @inline
 def gap_value(left: np.float32, right: np.float32, to_left: int, to_right: int, nearest: bool) -> np.float32:
-    """Return what a gap's pixel takes from its valid ends, which are so many pixels away."""
+    """Return the value of a gap's pixel from its valid ends and the distances to them, pixels."""
     if nearest and to_left != to_right:
         return left if to_left < to_right else right
     return min(left, right)

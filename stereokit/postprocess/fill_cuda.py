@@ -72,7 +72,7 @@ def fill_rows(disparity, valid, some, height, width, mode):  # type: ignore[no-u
 
 
 @kernel(array(f32), array(u8), u32, u32, f32)
-def fill_empty(disparity, some, height, width, nothing):  # type: ignore[no-untyped-def]
+def fill_empty(disparity, some, height, width, empty_value):  # type: ignore[no-untyped-def]
     """Copy the nearest row that has valid pixels, the upper of equals, to the row of the block that has none."""
     y = u32(cuda.blockIdx.x)
     if some[y] != u8(0):  # the whole block
@@ -87,24 +87,24 @@ def fill_empty(disparity, some, height, width, nothing):  # type: ignore[no-unty
         away = u32(away + u32(1))
     x = u32(cuda.threadIdx.x)
     while x < width:
-        value = f32(nothing)
+        value = f32(empty_value)
         if source < height:
             value = disparity[u32(u32(source * width) + x)]
         disparity[u32(u32(y * width) + x)] = value
         x = u32(x + u32(cuda.blockDim.x))
 
 
-def fill(queue: Queue, disparity: Any, mode: str | None, nothing: float, shape: tuple[int, int]) -> Any:
+def fill(queue: Queue, disparity: Any, mode: str | None, empty_value: float, shape: tuple[int, int]) -> Any:
     """Fill a map in place and return which of its pixels were valid before.
 
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
     mode : {"background", "nearest"} or None
-        Which end of a gap fills it; None fills nothing.
-    nothing : float
+        Rule of filling; None leaves gaps.
+    empty_value : float
         Disparity of a filled map in which no pixel was valid.
     shape : (int, int)
         Height and width, pixels.
@@ -120,5 +120,5 @@ def fill(queue: Queue, disparity: Any, mode: str | None, nothing: float, shape: 
     blocks = blocks_for(32 * height, fill_rows.block)
     queue.launch(fill_rows, blocks, disparity, valid, some, height, width, _MODES[mode])
     if mode is not None:
-        queue.launch(fill_empty, height, disparity, some, height, width, np.float32(nothing))
+        queue.launch(fill_empty, height, disparity, some, height, width, np.float32(empty_value))
     return valid

@@ -65,14 +65,16 @@ def median_rows(
     part = source[top:bottom]
     if not dense and (gaps := np.isnan(part)).any():
         window, border = (size, size), cv2.BORDER_REPLICATE
-        known = np.asarray(
+        valid_count = np.asarray(
             cv2.boxFilter((~gaps).view(np.uint8), -1, window, normalize=False, borderType=border), np.uint8
         )
         wide = np.asarray(cv2.copyMakeBorder(part, half, half, half, half + LANES, border), np.float32)
         wide[np.isnan(wide)] = np.inf
-        room = np.empty(size * size * LANES, np.float32)
+        windows = np.empty(size * size * LANES, np.float32)
         network = _network(size * size)
-        _median_of_valid(wide.ravel(), size, part.shape[1], y0 - top, known[y0 - top :], network, room, out[y0:y1])
+        _median_of_valid(
+            wide.ravel(), size, part.shape[1], y0 - top, valid_count[y0 - top :], network, windows, out[y0:y1]
+        )
         out[y0:y1][gaps[y0 - top : y1 - top]] = np.nan
     elif top == y0 and bottom == y1:
         cv2.medianBlur(part, size, dst=out[y0:y1])
@@ -99,19 +101,19 @@ def _network(count: int) -> NDArray[np.int64]:
 
 @kernel
 def _median_of_valid(
-    wide: NDArray[np.float32], size: int, width: int, y0: int, known: NDArray[np.uint8], pairs: NDArray[np.int64],
-    held: NDArray[np.float32], out: NDArray[np.float32],
+    wide: NDArray[np.float32], size: int, width: int, y0: int, valid_count: NDArray[np.uint8], pairs: NDArray[np.int64],
+    windows: NDArray[np.float32], out: NDArray[np.float32],
 ) -> None:  # fmt: skip
     stride = width + size - 1 + LANES
     for y in range(out.shape[0]):
         for x0 in range(0, width, LANES):
             for k in range(size * size):
-                store(held, k * LANES, load(wide, (y0 + y + k // size) * stride + x0 + k % size))
+                store(windows, k * LANES, load(wide, (y0 + y + k // size) * stride + x0 + k % size))
             for n in range(len(pairs)):
                 first, second = pairs[n, 0] * LANES, pairs[n, 1] * LANES
-                a, b = load(held, first), load(held, second)
-                store(held, first, minimum(a, b))
-                store(held, second, maximum(a, b))
+                a, b = load(windows, first), load(windows, second)
+                store(windows, first, minimum(a, b))
+                store(windows, second, maximum(a, b))
             for x in range(x0, min(x0 + LANES, width)):
-                middle = (np.int64(known[y, x]) - 1) // 2
-                out[y, x] = held[max(middle, 0) * LANES + x - x0]
+                middle = (np.int64(valid_count[y, x]) - 1) // 2
+                out[y, x] = windows[max(middle, 0) * LANES + x - x0]

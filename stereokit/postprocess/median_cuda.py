@@ -2,7 +2,7 @@
 
 Invalid values of a window count as minus and plus infinity in turn, minus first: so the middle of all values is the
 lower of the middle two of the valid ones. The middle is found by forgetting (McGuire 2008): of half the values and
-two more, the lowest and the highest cannot be the middle; they are dropped and one more value is taken in, until
+two more, the lowest and the highest cannot be the middle; they are dropped and one more value is newest in, until
 three are left.
 """
 
@@ -25,21 +25,21 @@ def _middle_of_three(values):  # type: ignore[no-untyped-def]
     return max(low, min(high, values[2]))
 
 
-def _forgetting(kept: int, taken: int, then: Any) -> Any:
-    """Return the helper that drops the extremes of the first `kept` values, takes in another and goes on."""
+def _forgetting(count: int, newest: int, then: Any) -> Any:
+    """Return the helper that drops the extremes of the first `count` values, takes in another and goes on."""
 
     @device
     def forget(values):  # type: ignore[no-untyped-def]
-        for k in range(kept // 2):
-            a, b = values[k], values[kept - 1 - k]
-            values[k], values[kept - 1 - k] = min(a, b), max(a, b)
-        for k in range(1, (kept + 1) // 2):
+        for k in range(count // 2):
+            a, b = values[k], values[count - 1 - k]
+            values[k], values[count - 1 - k] = min(a, b), max(a, b)
+        for k in range(1, (count + 1) // 2):
             a, b = values[0], values[k]
             values[0], values[k] = min(a, b), max(a, b)
-        for k in range(kept // 2, kept - 1):
-            a, b = values[k], values[kept - 1]
-            values[k], values[kept - 1] = min(a, b), max(a, b)
-        values[0] = values[taken]  # the lowest makes room; the highest is out of the range of the next helper
+        for k in range(count // 2, count - 1):
+            a, b = values[k], values[count - 1]
+            values[k], values[count - 1] = min(a, b), max(a, b)
+        values[0] = values[newest]  # the lowest makes room; the highest is out of the range of the next helper
         return then(values)
 
     return forget
@@ -49,8 +49,8 @@ def _make_median(size: int) -> Kernel:
     half, area = size // 2, size * size
     first = area // 2 + 2
     middle = _middle_of_three
-    for kept, taken in enumerate(range(area - 1, first - 1, -1), 4):
-        middle = _forgetting(kept, taken, middle)
+    for count, newest in enumerate(range(area - 1, first - 1, -1), 4):
+        middle = _forgetting(count, newest, middle)
 
     @kernel(array(f32), array(f32), i32, i32, name=f"median_{size}")
     def median(source, out, height, width):  # type: ignore[no-untyped-def]
@@ -74,8 +74,8 @@ def _make_median(size: int) -> Kernel:
             value = middle(values)
         out[at] = value
 
-    made: Kernel = median
-    return made
+    result: Kernel = median
+    return result
 
 
 _KERNELS = {size: _make_median(size) for size in (3, 5)}
@@ -87,7 +87,7 @@ def median(queue: Queue, disparity: Any, size: int, shape: tuple[int, int]) -> A
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
     size : {3, 5}
         Side of the window in pixels.

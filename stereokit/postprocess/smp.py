@@ -84,11 +84,11 @@ def resolve_rows(
             if xr < 0:
                 row[x] = np.nan
                 continue
-            held = owner[xr]
-            if held < 0:
+            rival = owner[xr]
+            if rival < 0:
                 owner[xr] = np.int32(x)
-            elif cost[y, x] < cost[y, held] or (cost[y, x] == cost[y, held] and d > row[held]):
-                row[held] = np.nan
+            elif cost[y, x] < cost[y, rival] or (cost[y, x] == cost[y, rival] and d > row[rival]):
+                row[rival] = np.nan
                 owner[xr] = np.int32(x)
             else:
                 row[x] = np.nan

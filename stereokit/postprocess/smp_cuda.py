@@ -62,8 +62,8 @@ def _make_resolve(name: str, cost: Any, bits: Any) -> Kernel:
                 disparity[at] = f32(np.nan)
             x = u32(x + step)
 
-    made: Kernel = resolve
-    return made
+    result: Kernel = resolve
+    return result
 
 
 _resolve_short = _make_resolve("smp_short", u16, _bits_of_short)
@@ -76,7 +76,7 @@ def resolve(queue: Queue, disparity: Any, cost: Any, shape: tuple[int, int]) -> 
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
     cost : (H * W,) uint16 or float32
         Aggregated cost of each pixel's match.

@@ -34,11 +34,11 @@ def remove_speckles(
     size : int
         Largest region that is removed, pixels.
     difference : float
-        How much neighbours of one region differ at most, pixels.
+        Largest difference of neighbours in one region, pixels.
     threads : int
         Threads to use; the result does not depend on it.
     workspace : Workspace or None
-        Where buffers are kept between calls.
+        Home of the buffers between calls.
 
     Returns
     -------
@@ -111,17 +111,17 @@ def find_regions(
                 label[at] = -1
                 at += 1
                 continue
-            mine = np.int64(fresh)
+            own = np.int64(fresh)
             fresh += 1
-            parent[mine] = np.int32(mine)
-            count[mine] = 0
+            parent[own] = np.int32(own)
+            count[own] = 0
             start = at
             joined = np.int32(-1)  # the label above that this run was last joined to
             while True:
-                label[at] = np.int32(mine)
+                label[at] = np.int32(own)
                 if above and alike(d, disparity[at - width], limit) and label[at - width] != joined:
                     joined = label[at - width]
-                    _unite(parent, count, mine, np.int64(joined))
+                    _unite(parent, count, own, np.int64(joined))
                 at += 1
                 if at >= end:
                     break
@@ -129,7 +129,7 @@ def find_regions(
                 d = disparity[at]
                 if not alike(d, before, limit):
                     break
-            root = mine
+            root = own
             while parent[root] != root:
                 root = np.int64(parent[root])
             count[root] += np.int32(at - start)
@@ -155,14 +155,14 @@ def erase(
     last = np.int32(-1)
     small = False
     for at in range(start, stop):
-        mine = label[at]
-        if mine < 0:
+        own = label[at]
+        if own < 0:
             continue
-        if mine != last:
-            root = np.int64(mine)
+        if own != last:
+            root = np.int64(own)
             while parent[root] != root:
                 root = np.int64(parent[root])
             small = count[root] <= size
-            last = mine
+            last = own
         if small:
             disparity[at] = np.nan

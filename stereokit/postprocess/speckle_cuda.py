@@ -155,14 +155,14 @@ def remove(queue: Queue, disparity: Any, size: int, shape: tuple[int, int], diff
     Parameters
     ----------
     queue : Queue
-        Where to run.
+        Queue of launches.
     disparity : (H * W,) float32, pixels, NaN where invalid
     size : int
         Largest region that is removed, pixels.
     shape : (int, int)
         Height and width, pixels.
     difference : float
-        How much neighbours of one region differ at most, pixels.
+        Largest difference of neighbours in one region, pixels.
     """
     height, width = shape
     pixels = height * width

@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from stereokit.errors import InputError
 from stereokit.images.check import MAX_DISPARITY, check_flag, check_integer
 from stereokit.images.maps import numbers
+from stereokit.kernels import simd
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.simd import LANES, choose, first_bit, load, lowest, mask_equal, minimum, splat
+from stereokit.kernels.simd import LANES, first_bit, load, lowest, mask_equal, minimum, splat
 
-__all__ = ["Winners", "margin_of", "parabola", "select", "select_row", "winners_like"]
+__all__ = ["SelectionOutput", "margin_of", "parabola", "select", "select_row", "selection_output"]
 
 
-class Winners(NamedTuple):
-    """What selection writes, all ``(H, W)`` and flat for kernels."""
+class SelectionOutput(NamedTuple):
+    """Maps that selection writes, ``(H, W)`` and flat for kernels, and its rules."""
 
     disparity: NDArray[np.float32]  # pixels
     cost: NDArray[Any]  # aggregated cost of the winner
@@ -41,18 +42,18 @@ def _best_level(keys: NDArray[Any], at: int, blocks: tuple[int, ...]) -> tuple[A
     for n in range(1, len(blocks)):
         smallest = minimum(smallest, load(keys, at + n * LANES))
     value = lowest(smallest)
-    wanted = splat(value)
+    lowest_key = splat(value)
     level = np.int64(0)
     for back in range(len(blocks)):
         block = (len(blocks) - 1 - back) * LANES
-        first = first_bit(mask_equal(load(keys, at + block), wanted))
-        level = choose(first < 64, block + first, level)
+        first = first_bit(mask_equal(load(keys, at + block), lowest_key))
+        level = simd.select(first < 64, block + first, level)
     return value, level
 
 
 @inline
 def parabola(before: np.float32, best: np.float32, behind: np.float32) -> np.float32:
-    """Return where between its neighbours the lowest point of three costs lies, as an offset in levels."""
+    """Return the offset in levels of the lowest point of a parabola through three costs."""
     bend = before + behind - np.float32(2) * best
     offset: np.float32 = (before - behind) / (np.float32(2) * bend) if bend > np.float32(0) else np.float32(0)
     return offset
@@ -60,14 +61,14 @@ def parabola(before: np.float32, best: np.float32, behind: np.float32) -> np.flo
 
 @inline
 def margin_of(best: np.float32, rival: np.float32) -> np.float32:
-    """Return by which share of the rival's cost the best one is lower."""
+    """Return the margin between the best cost and its rival's, as a share of the latter."""
     share: np.float32 = (rival - best) / rival if rival > np.float32(0) else np.float32(0)
     return share
 
 
 @inline
 def select_pixel(
-    keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], to: int, out: Winners
+    keys: NDArray[Any], values: NDArray[Any], at: int, blocks: tuple[int, ...], to: int, out: SelectionOutput
 ) -> None:
     """Write the winner among the levels from element `at` on to element `to` of the maps.
 
@@ -99,17 +100,17 @@ def _rival(keys: NDArray[Any], at: int, blocks: tuple[int, ...], level: int, lev
     """Return the level of the lowest cost that is not next to the winner, the lowest of equals; `level` if none is."""
     first = max(level - 1, 0)
     behind_last = min(level + 2, levels)
-    held_0 = keys[at + first]
-    held_1 = keys[at + level]
-    held_2 = keys[at + behind_last - 1]
+    first_key = keys[at + first]
+    level_key = keys[at + level]
+    last_key = keys[at + behind_last - 1]
     most = np.iinfo(keys.dtype).max
     keys[at + first] = most
     keys[at + level] = most
     keys[at + behind_last - 1] = most
     _, other = _best_level(keys, at, blocks)
-    keys[at + level] = held_1
-    keys[at + first] = held_0
-    keys[at + behind_last - 1] = held_2
+    keys[at + level] = level_key
+    keys[at + first] = first_key
+    keys[at + behind_last - 1] = last_key
     if other >= levels or (other >= first and other < behind_last):
         return level
     return other
@@ -117,29 +118,29 @@ def _rival(keys: NDArray[Any], at: int, blocks: tuple[int, ...], level: int, lev
 
 @kernel
 def select_row(
-    keys: NDArray[Any], values: NDArray[Any], width: int, blocks: tuple[int, ...], to: int, out: Winners
+    keys: NDArray[Any], values: NDArray[Any], width: int, blocks: tuple[int, ...], to: int, out: SelectionOutput
 ) -> None:
     """Select all pixels of one row of aggregated costs, ``(W, P)`` flat, into the maps from element `to` on."""
     for x in range(width):
         select_pixel(keys, values, x * LANES * len(blocks), blocks, to + x, out)
 
 
-def winners_like(
+def selection_output(
     disparity: NDArray[np.float32], cost: NDArray[Any], confidence: NDArray[np.float32] | None,
     levels: int, minimum_disparity: int, subpixel: bool, uniqueness: float = 0.0,
     candidates: NDArray[np.float32] | None = None,
-) -> Winners:  # fmt: skip
+) -> SelectionOutput:  # fmt: skip
     """Return the flat view of the maps that kernels write; `candidates` come with a `confidence` only."""
-    nobody = np.empty(0, np.float32)
-    return Winners(
-        disparity.ravel(),
-        cost.ravel(),
-        nobody if confidence is None else confidence.ravel(),
-        nobody if candidates is None else candidates.ravel(),
-        levels,
-        minimum_disparity,
-        subpixel,
-        np.float32(uniqueness / 100),
+    empty = np.empty(0, np.float32)
+    return SelectionOutput(
+        disparity=disparity.ravel(),
+        cost=cost.ravel(),
+        confidence=empty if confidence is None else confidence.ravel(),
+        candidates=empty if candidates is None else candidates.ravel(),
+        levels=levels,
+        minimum=minimum_disparity,
+        subpixel=subpixel,
+        uniqueness=np.float32(uniqueness / 100),
     )
 
 
@@ -183,32 +184,32 @@ def select(
     disparity = np.empty((height, width), np.float32)
     cost = np.empty((height, width), volume.dtype)
     confidence = np.empty((height, width), np.float32)
-    out = winners_like(disparity, cost, confidence, count, low, subpixel)
+    out = selection_output(disparity, cost, confidence, count, low, subpixel)
     worst = np.iinfo(volume.dtype).max if volume.dtype.kind in "iu" else np.finfo(volume.dtype).max
     blocks = tuple(range(padded // LANES))
     row = np.full((width, padded), worst, volume.dtype)
     for y in range(height):
-        known = np.isfinite(volume[y])
-        row[:, :count] = np.where(known, volume[y], worst) + volume.dtype.type(0)  # no -0, whose bits are the lowest
+        finite = np.isfinite(volume[y])
+        row[:, :count] = np.where(finite, volume[y], worst) + volume.dtype.type(0)  # no -0, whose bits are the lowest
         if row.min() < 0:
             raise InputError(f"volume must not be negative, got {row.min()}")
         values = row.ravel()
         select_row(keys_of(values), values, width, blocks, y * width, out)
-        if not known.all():
-            _amend(known, row.argmin(axis=1), low, disparity[y], cost[y], confidence[y])
+        if not finite.all():
+            _amend(finite, row.argmin(axis=1), low, disparity[y], cost[y], confidence[y])
     return disparity, cost, confidence
 
 
 def _amend(
-    known: NDArray[np.bool_], best: NDArray[np.intp], low: int, disparity: NDArray[np.float32], cost: NDArray[Any],
+    finite: NDArray[np.bool_], best: NDArray[np.intp], low: int, disparity: NDArray[np.float32], cost: NDArray[Any],
     confidence: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Take from the pixels of a row what comes of levels without a cost."""
-    beside = np.stack([np.clip(best - 1, 0, None), np.clip(best + 1, None, known.shape[1] - 1)], axis=1)
-    alone = ~np.take_along_axis(known, beside, axis=1).all(axis=1)
+    """Undo in the pixels of a row the interpolation with levels that have no cost, and the choice among such levels."""
+    beside = np.stack([np.clip(best - 1, 0, None), np.clip(best + 1, None, finite.shape[1] - 1)], axis=1)
+    alone = ~np.take_along_axis(finite, beside, axis=1).all(axis=1)
     disparity[alone] = best[alone] + low
-    nothing = ~known.any(axis=1)
-    disparity[nothing], cost[nothing], confidence[nothing] = np.nan, np.nan, 0
+    empty = ~finite.any(axis=1)
+    disparity[empty], cost[empty], confidence[empty] = np.nan, np.nan, 0
 
 
 def keys_of(values: NDArray[Any]) -> NDArray[Any]:

@@ -34,15 +34,24 @@ from stereokit.cuda.kernel import (
 )
 from stereokit.selection.wta import margin_of, parabola
 
-__all__ = ["RULES", "Maps", "doubt", "group_of", "lowest_of_group", "select", "select_kernel", "selector"]
+__all__ = [
+    "RULES",
+    "Maps",
+    "group_of",
+    "lowest_of_group",
+    "select",
+    "select_kernel",
+    "selector",
+    "zero_invalid_confidence",
+]
 
 RULES = (i32, i32, i32, f32, i32)
-"""Types of the number of levels, the lowest disparity, whether to interpolate, the least margin, and how much to write
-of the confidence: 0 nothing, 1 itself, 2 the candidates too."""
+"""Types of the number of levels, the lowest disparity, whether to interpolate, the least margin, and the detail
+(`stereokit.settings.Detail`): 0 neither confidence nor candidates, 1 the confidence, 2 both."""
 
 
 class Maps(NamedTuple):
-    """What selection writes and by which rules; the last arguments of kernels that select.
+    """Maps of the selection and its rules; the last arguments of kernels that select.
 
     The maps are flat, ``(H * W)`` on the device; `confidence` has one element where nobody asked for it, and thrice as
     many with candidates: behind it lie the winners again, and the best that are not next to them.
@@ -55,11 +64,11 @@ class Maps(NamedTuple):
     minimum: int
     subpixel: int
     uniqueness: np.float32  # 0 to 1
-    confident: int
+    detail: int
 
 
 def group_of(padded: int) -> tuple[int, int]:
-    """Return how many lanes share the levels of a pixel, and how many levels each of them has."""
+    """Return the number of lanes that share the levels of a pixel, and the levels of each."""
     lanes = min(32, padded // 4)
     return lanes, padded // lanes
 
@@ -84,7 +93,7 @@ def lowest_of_group(lanes: int) -> Any:
 @cache
 def selector(padded: int, floats: bool) -> Any:
     """Return the helper that selects among values in registers; all lanes of the warp must call it."""
-    lanes, held = group_of(padded)
+    lanes, per_lane = group_of(padded)
     lowest_of = lowest_of_group(lanes)
     kind = f32 if floats else i32
     most = np.float32(np.finfo(np.float32).max) if floats else np.int32(2**31 - 1)
@@ -92,48 +101,48 @@ def selector(padded: int, floats: bool) -> Any:
 
     @device
     def choose(  # type: ignore[no-untyped-def]
-        values, lane, at, alive, disparity, cost, confidence, levels, minimum, subpixel, uniqueness, confident
+        values, lane, at, alive, disparity, cost, confidence, levels, minimum, subpixel, uniqueness, detail
     ):
         place = i32(lane & i32(lanes - 1))
-        first = i32(place * i32(held))
-        below = shuffle_up(values[held - 1], 1)
+        first = i32(place * i32(per_lane))
+        below = shuffle_up(values[per_lane - 1], 1)
         above = shuffle_down(values[0], 1)
         best, before, behind = kind(most), kind(0), kind(0)
         level = i32(0)
-        for k in range(held):
+        for k in range(per_lane):
             value = values[k] if i32(first + i32(k)) < levels else kind(most)
             if value < best:
                 best = value
                 level = i32(first + i32(k))
                 before = values[k - 1] if k > 0 else below
-                behind = values[k + 1] if k < held - 1 else above
+                behind = values[k + 1] if k < per_lane - 1 else above
         lowest = lowest_of(best)
         votes = u32(cuda.ballot_sync(FULL, best == lowest))
         base = u32(u32(lane) & u32(32 - lanes))
         winner = i32(cuda.ffs(u32(u32(votes >> base) & u32(group_bits)))) - 1
         margin = f32(1)
         other = i32(0)
-        if confident != 0 or uniqueness > f32(0):
-            chosen = shuffle_from(level, i32(base) + winner)
+        if detail != 0 or uniqueness > f32(0):
+            winner_level = shuffle_from(level, i32(base) + winner)
             rival = kind(most)
-            for k in range(held):
-                away = i32(abs(i32(first + i32(k) - chosen)))
+            for k in range(per_lane):
+                away = i32(abs(i32(first + i32(k) - winner_level)))
                 if i32(first + i32(k)) < levels and away > 1 and values[k] < rival:
                     rival = values[k]
                     other = i32(first + i32(k))
-            mine = rival
+            own_rival = rival
             rival = lowest_of(rival)
             if rival < kind(most):
                 margin = margin_of(f32(lowest), f32(rival))
-            if confident > 1:
-                votes = u32(cuda.ballot_sync(FULL, mine == rival))
+            if detail > 1:
+                votes = u32(cuda.ballot_sync(FULL, own_rival == rival))
                 other = shuffle_from(other, i32(base) + i32(cuda.ffs(u32(u32(votes >> base) & u32(group_bits)))) - 1)
-                other = other if rival < kind(most) else chosen
+                other = other if rival < kind(most) else winner_level
         if alive and place == winner:
             result = f32(i32(level + minimum))
             if subpixel != 0 and level > 0 and level < levels - 1:
                 result = f32(result + parabola(f32(before), f32(best), f32(behind)))
-            if confident > 1:
+            if detail > 1:
                 pixels = u32(u32(confidence.size) // u32(3))
                 confidence[at + pixels] = result
                 confidence[at + pixels + pixels] = f32(i32(other + minimum))
@@ -141,7 +150,7 @@ def selector(padded: int, floats: bool) -> Any:
                 result = f32(np.nan)
             disparity[at] = result
             cost[at] = best
-            if confident != 0:
+            if detail != 0:
                 confidence[at] = margin
 
     return choose
@@ -150,7 +159,7 @@ def selector(padded: int, floats: bool) -> Any:
 @cache
 def select_kernel(padded: int, floats: bool) -> Kernel:
     """Return the kernel that selects from a volume, ``(H, band, padded)``, of columns `first` to `first` + `band`."""
-    lanes, held = group_of(padded)
+    lanes, per_lane = group_of(padded)
     choose = selector(padded, floats)
     value, out = (f32, f32) if floats else (u16, u16)
     register = f32 if floats else i32
@@ -160,28 +169,28 @@ def select_kernel(padded: int, floats: bool) -> Kernel:
     @kernel(array(value), i32, i32, i32, i32, *maps, block=128, name=name)
     def select(  # type: ignore[no-untyped-def]
         volume, first, band, height, width, disparity, cost, confidence,
-        levels, minimum, subpixel, uniqueness, confident,
+        levels, minimum, subpixel, uniqueness, detail,
     ):  # fmt: skip
         thread = u32(cuda.grid(1))
         lane = i32(thread & u32(31))
         pixel = u32(thread // u32(lanes))
         alive = pixel < u32(u32(height) * u32(band))
         pixel = min(pixel, u32(u32(u32(height) * u32(band)) - u32(1)))
-        values = cuda.local.array(held, register)
-        source = u32(u32(pixel * u32(padded)) + u32(u32(lane & i32(lanes - 1)) * u32(held)))
-        for j in range(0, held, 4):
+        values = cuda.local.array(per_lane, register)
+        source = u32(u32(pixel * u32(padded)) + u32(u32(lane & i32(lanes - 1)) * u32(per_lane)))
+        for j in range(0, per_lane, 4):
             a, b, c, d = load4(volume, u32(source + u32(j)))
             values[j], values[j + 1], values[j + 2], values[j + 3] = register(a), register(b), register(c), register(d)
         y = u32(pixel // u32(band))
         at = u32(u32(y * u32(width)) + u32(first) + u32(pixel - u32(y * u32(band))))
-        choose(values, lane, at, alive, disparity, cost, confidence, levels, minimum, subpixel, uniqueness, confident)
+        choose(values, lane, at, alive, disparity, cost, confidence, levels, minimum, subpixel, uniqueness, detail)
 
-    made: Kernel = select
-    return made
+    result: Kernel = select
+    return result
 
 
 @kernel(array(f32), array(u8), i32, block=128)
-def doubt(confidence, valid, pixels):  # type: ignore[no-untyped-def]
+def zero_invalid_confidence(confidence, valid, pixels):  # type: ignore[no-untyped-def]
     """Set the confidence of pixels that are not valid to 0."""
     at = u32(cuda.grid(1))
     if at < u32(pixels) and valid[at] == 0:
@@ -197,7 +206,7 @@ def select(
     queue: Queue, totals: Any, floats: bool, first: int, band: int, shape: tuple[int, int], padded: int, maps: Maps
 ) -> None:
     """Select the pixels of a band of columns from their aggregated costs, ``(H, band, padded)`` uint16 or float32."""
-    made = select_kernel(padded, floats)
+    kernel_of_size = select_kernel(padded, floats)
     lanes, _ = group_of(padded)
-    blocks = blocks_for(shape[0] * band * lanes, made.block)
-    queue.launch(made, blocks, totals, first, band, *shape, *maps)
+    blocks = blocks_for(shape[0] * band * lanes, kernel_of_size.block)
+    queue.launch(kernel_of_size, blocks, totals, first, band, *shape, *maps)

@@ -25,7 +25,7 @@ HOT = ("first_visit", "_last_visit", "_produce_rows", "_filter_band", "_census_r
 """Kernels that a frame's time goes to, by the name of their function."""
 
 KINDS = {
-    # a lane of a vector to a general register or back, one at a time: what scalarised code is made of
+    # a lane of a vector to a general register or back, one at a time: the mark of scalarised code
     "lane_moves": r"(?:umov|smov)\b"
     r"|mov\t[wx]\d+, v\d+\.[bhsd]\["
     r"|(?:mov|ins)\tv\d+\.[bhsd]\[\d+\], [wx]"
@@ -52,13 +52,13 @@ def record(path: str) -> None:
     image = np.random.default_rng(0).integers(0, 256, (24, 80), dtype=np.uint8)
     for method in METHODS:
         stereokit.Matcher(method, max_disparity=128, threads=1)(image, image)
-    found = {}
+    signatures = {}
     for name, module in sorted(sys.modules.items()):
         for key in HOT:
             kernel = vars(module).get(key) if name.startswith("stereokit.") else None
             if isinstance(kernel, Dispatcher) and kernel.py_func.__module__ == name and kernel.signatures:
-                found[name, key] = [tuple(signature) for signature in kernel.signatures]
-    Path(path).write_bytes(dumps(found))
+                signatures[name, key] = [tuple(signature) for signature in kernel.signatures]
+    Path(path).write_bytes(dumps(signatures))
 
 
 def count(signatures: str, out: str) -> None:
@@ -79,9 +79,9 @@ def count(signatures: str, out: str) -> None:
     import stereokit.matching  # noqa: F401 (its types come before the signatures)
 
     table = {}
-    for (name, key), found in pickle.loads(Path(signatures).read_bytes()).items():
+    for (name, key), overloads in pickle.loads(Path(signatures).read_bytes()).items():
         kernel = getattr(importlib.import_module(name), key)
-        for number, signature in enumerate(found):
+        for number, signature in enumerate(overloads):
             kernel.compile(signature)
             text = kernel.inspect_asm(kernel.signatures[-1])
             table[f"{key}.{number}" if number else key] = counted(text)
@@ -89,12 +89,12 @@ def count(signatures: str, out: str) -> None:
 
 
 def counted(text: str) -> dict[str, int]:
-    """Return how many instructions of each kind stand in a text of assembly."""
+    """Return the number of instructions of each kind in a text of assembly."""
     lines = [line.strip() for line in text.splitlines() if line.startswith("\t") and not line.startswith("\t.")]
-    found = Counter({kind: 0 for kind in KINDS})
+    counts = Counter({kind: 0 for kind in KINDS})
     for line in lines:
-        found.update(kind for kind, pattern in KINDS.items() if re.match(pattern, line))
-    return dict(found)
+        counts.update(kind for kind, pattern in KINDS.items() if re.match(pattern, line))
+    return dict(counts)
 
 
 if __name__ == "__main__":

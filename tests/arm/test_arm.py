@@ -27,30 +27,30 @@ USED = {
 
 @pytest.fixture(scope="module")
 def counts(run_python, tmp_path_factory):
-    """Return how often each kind of instruction stands in a kernel, by the kernel's name."""
+    """Return the number of instructions of each kind, by the kernel's name."""
     folder = tmp_path_factory.mktemp("arm")
     # Caches of their own: what comes out of a cache has no assembly, and its inner kernels no signatures.
     cache = {"NUMBA_CACHE_DIR": str(folder / "cache")}
     run_python(HERE / "cross.py", "record", folder / "signatures", **cache)
     cache = {"NUMBA_CACHE_DIR": str(folder / "cross-cache")}
     run_python(HERE / "cross.py", "count", folder / "signatures", folder / "counts.json", **cache)
-    found = json.loads((folder / "counts.json").read_text(encoding="utf-8"))
-    if "missing" in found:
-        pytest.skip(f"llvmlite cannot compile for 64-bit ARM here: {found['missing']}")
-    return found
+    table = json.loads((folder / "counts.json").read_text(encoding="utf-8"))
+    if "missing" in table:
+        pytest.skip(f"llvmlite cannot compile for 64-bit ARM here: {table['missing']}")
+    return table
 
 
 def test_every_hot_kernel_is_compiled_and_has_a_budget(counts):
     assert set(counts) == set(BUDGET)
-    assert all(found["vector"] > 50 for found in counts.values())
+    assert all(table["vector"] > 50 for table in counts.values())
 
 
 @pytest.mark.parametrize("kind", ["lane_moves", "stack", "all"])
 def test_kernels_stay_in_their_budgets(counts, kind):
     over = {
-        name: (found[kind], BUDGET[name][kind])
-        for name, found in counts.items()
-        if found[kind] > ROOM * BUDGET[name][kind] + FEW
+        name: (table[kind], BUDGET[name][kind])
+        for name, table in counts.items()
+        if table[kind] > ROOM * BUDGET[name][kind] + FEW
     }
     assert not over, f"{kind} of (now, budget): {over}"
 
@@ -82,6 +82,6 @@ def test_what_is_counted():
             "mov\tx0, x1",
         )
     )
-    found = cross.counted(f"kernel:\n{text}\n")
+    table = cross.counted(f"kernel:\n{text}\n")
     expected = {"lane_moves": 3, "stack": 2, "cnt": 1, "uqadd": 1, "umin": 0, "ext": 1, "all": 11}
-    assert {kind: found[kind] for kind in expected} == expected
+    assert {kind: table[kind] for kind in expected} == expected

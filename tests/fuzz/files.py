@@ -18,7 +18,7 @@ from stereokit.calibration import read_calibration
 from stereokit.errors import StereokitError
 from stereokit.large.sources import open_source
 from stereokit_evaluation.batch.pairs import list_pairs
-from stereokit_evaluation.batch.store import held
+from stereokit_evaluation.batch.store import open_output
 from stereokit_refiners.weights import read as read_weights
 
 __all__ = ["run_file"]
@@ -72,7 +72,7 @@ def samples() -> dict[str, tuple[bytes, ...]]:
 
 
 def _manifest(path: Path) -> None:
-    with held(path.parent, {"format": 1}, ".png", lambda name: True, False):
+    with open_output(path.parent, {"format": 1}, ".png", lambda name: True, False):
         pass
 
 
@@ -96,27 +96,27 @@ def mutated(rng: Rng, content: bytes) -> bytes:
     data = bytearray(content)
     near = min(len(data), 2000) if rng.random() < 0.7 else len(data)  # headers are where it matters
     for _ in range(rng.integers(1, 5)):
-        at = int(rng.integers(0, max(near, 1)))
+        offset = int(rng.integers(0, max(near, 1)))
         kind = rng.integers(9)
         if kind == 0 and data:
-            data[at % len(data)] ^= 1 << int(rng.integers(8))
+            data[offset % len(data)] ^= 1 << int(rng.integers(8))
         elif kind == 1 and data:
-            data[at % len(data)] = int(rng.choice([0, 255, 10, 32, 34, 39, 40, 44, 58, 91, 123]))
+            data[offset % len(data)] = int(rng.choice([0, 255, 10, 32, 34, 39, 40, 44, 58, 91, 123]))
         elif kind == 2:
-            del data[at : at + int(rng.integers(1, 40))]
+            del data[offset : offset + int(rng.integers(1, 40))]
         elif kind == 3:
-            data = data[:at]
+            data = data[:offset]
         elif kind == 4:
-            data[at:at] = rng.bytes(int(rng.integers(1, 40)))
+            data[offset:offset] = rng.bytes(int(rng.integers(1, 40)))
         elif kind == 5:
-            data[at:at] = data[at : at + int(rng.integers(1, 100))]
+            data[offset:offset] = data[offset : offset + int(rng.integers(1, 100))]
         elif kind == 6:
             value = int(rng.choice([0, 1, 2**15, 2**31 - 1, 2**32 - 1]))
-            data[at : at + 4] = struct.pack(str(rng.choice(["<I", ">I"])), value)
+            data[offset : offset + 4] = struct.pack(str(rng.choice(["<I", ">I"])), value)
         elif kind == 7:
-            data[at:at] = NUMBERS[rng.integers(len(NUMBERS))]
+            data[offset:offset] = NUMBERS[rng.integers(len(NUMBERS))]
         else:
-            data[at:at] = bytes(rng.choice([b"[", b"{", b'"', b"(", b"\n", b"\0", b"="])) * int(
+            data[offset:offset] = bytes(rng.choice([b"[", b"{", b'"', b"(", b"\n", b"\0", b"="])) * int(
                 rng.choice([1, 3, 20000])
             )
     return bytes(data)

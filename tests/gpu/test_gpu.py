@@ -42,14 +42,13 @@ def _pair(shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, np.ndarray]:
     return wide[:, columns], wide[:, columns + 64 * columns // width]
 
 
-def test_bodies(queue):
+def test_checks(queue):
     """Run each check of the interpreter's that needs nothing but a queue."""
-    import ptx
+    from ptx import checks
 
     ran = 0
-    for module in pkgutil.iter_modules(ptx.__path__):
-        held = importlib.import_module(f"ptx.{module.name}") if module.name.startswith("bodies_") else None
-        for name, check in vars(held).items() if held else ():
+    for info in pkgutil.iter_modules(checks.__path__):
+        for name, check in vars(importlib.import_module(f"ptx.checks.{info.name}")).items():
             if name.startswith("check_"):
                 parameters = inspect.signature(check).parameters.values()
                 if sum(parameter.default is parameter.empty for parameter in parameters) == 1:
@@ -60,14 +59,14 @@ def test_bodies(queue):
 
 @pytest.mark.parametrize("cost", [Census("5x5"), Census("9x7"), Zncc(3), Zncc(5), Zncc(11)], ids=str)
 def test_costs_of_a_full_image(queue, cost):
-    from ptx.bodies_costs import check_volume
+    from ptx.checks.costs import check_volume
 
     check_volume(queue, cost, SHAPE, Levels(0, 128))
 
 
 @pytest.mark.parametrize(("paths", "count"), [(4, 128), (5, 64), (8, 128), (4, 300)])
 def test_paths_of_a_full_image(queue, paths, count):
-    from ptx.bodies_sgm import check_paths
+    from ptx.checks.sgm import check_paths
 
     check_paths(queue, Sgm(15, 85, paths=paths), SHAPE, count, uniqueness=2.0)
 

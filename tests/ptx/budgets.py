@@ -1,4 +1,4 @@
-"""What the kernels take of a multiprocessor: registers, occupancy and instructions of the hot loop, per architecture.
+"""Needs of the kernels: registers, occupancy and instructions of the hot loop, per architecture.
 
 ``python -m ptx.budgets`` in ``tests/`` prints the table; with ``--write`` it replaces ``budgets.json``, which the tests
 hold the kernels to. PTX for sm_72 runs on every later card, so each kernel is compiled once and assembled four times.
@@ -57,7 +57,7 @@ def assembled(name: str, architecture: str) -> tuple[Code, Resources]:
 
 
 def resources(name: str, architecture: str) -> dict[str, int]:
-    """Return what a kernel takes.
+    """Return the needs of a kernel.
 
     Registers, bytes of stack and of spills of a thread, the share of warps that fit in percent, and the instructions of
     the hot loop.
@@ -73,14 +73,14 @@ def resources(name: str, architecture: str) -> dict[str, int]:
 
 def main(write: bool) -> None:
     """Print the table of all kernels; with `write`, keep it."""
-    kept = ("registers", "occupancy", "hot_loop")
+    columns = ("registers", "occupancy", "hot_loop")
     table = {}
     print(f"{'':24} registers, occupancy in percent, instructions of the hot loop")
     print(f"{'kernel':24} " + "  ".join(f"{architecture:>14}" for architecture in ARCHITECTURES))
     for name in sorted(kernels()):
-        found = {architecture: resources(name, architecture) for architecture in ARCHITECTURES}
-        table[name] = {architecture: {key: one[key] for key in kept} for architecture, one in found.items()}
-        shown = "  ".join(f"{r['registers']:3d} {r['occupancy']:4d} {r['hot_loop']:5d}" for r in found.values())
+        needs = {architecture: resources(name, architecture) for architecture in ARCHITECTURES}
+        table[name] = {architecture: {key: one[key] for key in columns} for architecture, one in needs.items()}
+        shown = "  ".join(f"{r['registers']:3d} {r['occupancy']:4d} {r['hot_loop']:5d}" for r in needs.values())
         print(f"{name:24} {shown}", flush=True)
     if write:
         rows = (

@@ -22,7 +22,7 @@ _NAMES = [machine.name for machine in MACHINES]
 
 
 def bench(*words: str) -> str:
-    """Return what ``stereokit bench --model`` prints."""
+    """Return the output of ``stereokit bench --model``."""
     done = CliRunner().invoke(app, ["bench", "--model", *words], catch_exceptions=False)
     if done.exit_code:
         raise SystemExit(done.output)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ptx.emulated import EmulatedQueue
+from ptx.interpreter.emulated import EmulatedQueue
 from stereokit import matching
 from stereokit.cli.app import app
 from stereokit.cuda import pipeline as cuda_pipeline
+from stereokit_evaluation.bench import baselines
 from stereokit_evaluation.bench import gpu as gpu_times
-from stereokit_evaluation.bench import peers
 from stereokit_evaluation.commands import bench as command
 
 SIZE = "40x10x16"
@@ -24,7 +24,7 @@ SIZE = "40x10x16"
 def waits(monkeypatch) -> list[int]:
     """Let the interpreter be the GPU; return the launches that there had been whenever the stream was waited for."""
     queues: list[EmulatedQueue] = []
-    found: list[int] = []
+    launches: list[int] = []
 
     def new_queue(stream: Any) -> EmulatedQueue:
         queues.append(EmulatedQueue())
@@ -35,16 +35,16 @@ def waits(monkeypatch) -> list[int]:
 
     monkeypatch.setattr(cuda_pipeline, "new_queue", new_queue)
     monkeypatch.setattr(cuda_pipeline, "_from_device", from_device)
-    monkeypatch.setattr(cuda_pipeline, "_reshaped", lambda held, shape: held.values.reshape(shape))
+    monkeypatch.setattr(cuda_pipeline, "_reshaped", lambda array, shape: array.values.reshape(shape))
     monkeypatch.setattr(cuda_pipeline.cuda, "default_stream", lambda: 0)
     monkeypatch.setattr(cuda_pipeline, "stream_of", lambda stream: stream)
     monkeypatch.setattr(matching, "require_device", lambda: None)
     monkeypatch.setattr(gpu_times, "require_device", lambda: None)
     monkeypatch.setattr(gpu_times, "_resident", lambda image: image.copy())
-    monkeypatch.setattr(gpu_times, "_wait", lambda: found.append(sum(len(queue.launches) for queue in queues)))
-    monkeypatch.setattr(command, "peers", lambda: [peers.THREE_WAY])
+    monkeypatch.setattr(gpu_times, "_wait", lambda: launches.append(sum(len(queue.launches) for queue in queues)))
+    monkeypatch.setattr(command, "baselines", lambda: [baselines.THREE_WAY])
     monkeypatch.setattr(command, "describe", lambda: "an interpreter")
-    return found
+    return launches
 
 
 def bench(*words):
@@ -54,12 +54,12 @@ def bench(*words):
 def test_host_and_device_images_and_a_peer(waits):
     done = bench("--method", "S2", "--rounds", 2, "--json", "-")
     assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
-    rows = {row["contender"]: row for row in found["results"]}
-    assert list(rows) == ["S2 census+sgm, GPU, host images", "S2 census+sgm, GPU, device images", peers.THREE_WAY]
+    report = json.loads(done.stdout)
+    rows = {row["contender"]: row for row in report["results"]}
+    assert list(rows) == ["S2 census+sgm, GPU, host images", "S2 census+sgm, GPU, device images", baselines.THREE_WAY]
     assert [row["kind"] for row in rows.values()] == ["method", "method", "peer"]
     assert all(row["runs"] == 2 and row["median_ms"] > 0 and row["x_3way"] > 0 for row in rows.values())
-    assert found["options"]["device"] == "an interpreter" and found["memory"] == found["first_call"] == []
+    assert report["options"]["device"] == "an interpreter" and report["memory"] == report["first_call"] == []
     assert len(waits) == 3 and waits == sorted(
         set(waits)
     )  # the first call is not timed; each call launches, then waits
@@ -82,5 +82,5 @@ def test_calls_give_the_map_of_the_cpu(waits):
         call = build(name, 16, 1)
         for _ in range(2):
             np.testing.assert_array_equal(np.asarray(call(left, right)), want)
-    peer = build(peers.THREE_WAY, 16, 1)
+    peer = build(baselines.THREE_WAY, 16, 1)
     assert peer(left, right).shape == left.shape

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from ptx import bodies_dt as bodies
-from ptx.emulated import EmulatedQueue
+from ptx.checks import dt as checks
+from ptx.interpreter.emulated import EmulatedQueue
 
-CHECKS = [getattr(bodies, name) for name in sorted(vars(bodies)) if name.startswith("check_")]
+CHECKS = [getattr(checks, name) for name in sorted(vars(checks)) if name.startswith("check_")]
 SMALL = [(3, 17, 130)]
 
 

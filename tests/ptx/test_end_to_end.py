@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
-from ptx.emulated import EmulatedQueue
-from ptx.harness import Buffer
+from ptx.interpreter.emulated import EmulatedQueue
+from ptx.interpreter.harness import Buffer
 from stereokit import Matcher, match_large, matching
 from stereokit.cuda import pipeline as cuda_pipeline
 from stereokit.errors import DeviceError, InputError
@@ -23,27 +23,27 @@ LEVELS = {"max_disparity": 14, "threads": 1}
 
 
 class _Queue(EmulatedQueue):
-    """A queue whose copies are kept, as those of a caller are."""
+    """A queue whose copies last, as those of a caller do."""
 
     copies = 0
 
-    def copy(self, held: Any) -> Any:
+    def copy(self, array: Any) -> Any:
         self.copies += 1
-        return self.upload(f"copy {self.copies}", held.values)
+        return self.upload(f"copy {self.copies}", array.values)
 
 
 @pytest.fixture
 def queues(monkeypatch):
     """Make the matcher believe in a GPU whose launches go to the interpreter; return its queues."""
-    made: list[_Queue] = []
+    queues: list[_Queue] = []
 
     def new_queue(stream: Any) -> _Queue:
-        made.append(_Queue())
-        return made[-1]
+        queues.append(_Queue())
+        return queues[-1]
 
     monkeypatch.setattr(cuda_pipeline, "new_queue", new_queue)
     monkeypatch.setattr(matching, "require_device", lambda: None)
-    return made
+    return queues
 
 
 def _pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -60,10 +60,10 @@ def _same(left: Any, right: Any, method: str, /, **options: Any) -> None:
     want = Matcher(method, device="cpu", **LEVELS, **options)(left, right)
     matcher = Matcher(method, device="cuda", **LEVELS, **options)
     assert matcher.device == "cuda"
-    found = matcher(left, right)
+    result = matcher(left, right)
     for name in ("disparity", "valid", "confidence", "right"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(want, name), name)
-    assert found.valid.any()
+        np.testing.assert_array_equal(getattr(result, name), getattr(want, name), name)
+    assert result.valid.any()
 
 
 @pytest.mark.parametrize("method", ["S1", "S2", "S3", "S4"])
@@ -102,8 +102,8 @@ def test_blank_images(queues):
     np.testing.assert_array_equal(matcher(blank, blank).disparity, want.disparity)
 
 
-class _Keeping:
-    """A refiner that keeps what it was given."""
+class _Recorder:
+    """A refiner that records its input."""
 
     needs_candidates = True
 
@@ -114,11 +114,11 @@ class _Keeping:
 
 @pytest.mark.parametrize("method", ["S1", "S2"])
 def test_candidates(queues, method):
-    kept = {device: _Keeping() for device in ("cpu", "cuda")}
-    for device, refiner in kept.items():
+    recorders = {device: _Recorder() for device in ("cpu", "cuda")}
+    for device, refiner in recorders.items():
         Matcher(method, device=device, scale=0.5, refiner=refiner, **LEVELS)(*_pair(9, 31))
     for name in ("disparity", "valid", "confidence", "candidates"):
-        np.testing.assert_array_equal(*(getattr(refiner.coarse, name) for refiner in kept.values()))
+        np.testing.assert_array_equal(*(getattr(refiner.coarse, name) for refiner in recorders.values()))
 
 
 def test_one_queue_serves_call_after_call_and_sizes(queues):
@@ -144,27 +144,27 @@ def host_as_device(queues, monkeypatch):
         channels = 1 if image.ndim == 2 else 3
         return cuda_pipeline._Image(np.ascontiguousarray(image).ravel(), image.dtype, channels, image.shape[:2])
 
-    def flat(held: Any) -> Buffer:
-        values = held.values if isinstance(held, Buffer) else np.asarray(held).ravel()
+    def flat(array: Any) -> Buffer:
+        values = array.values if isinstance(array, Buffer) else np.asarray(array).ravel()
         out = Buffer(values.size, values.dtype)
         out.values[:], out.known[:] = values, 1
         return out
 
     monkeypatch.setattr(cuda_pipeline, "_from_device", from_device)
     monkeypatch.setattr(cuda_pipeline, "stream_of", lambda stream: stream)
-    monkeypatch.setattr(cuda_pipeline, "_reshaped", lambda held, shape: held.values.reshape(shape))
+    monkeypatch.setattr(cuda_pipeline, "_reshaped", lambda array, shape: array.values.reshape(shape))
     monkeypatch.setattr(cuda_pipeline, "_flat", flat)
 
 
 def test_images_of_the_device(host_as_device):
     left, right = (np.repeat(image[:, :, None], 3, axis=2) for image in _pair(8, 26))
     options = {**LEVELS, "right": True, "confidence": True}
-    found = Matcher("S2", device="cuda", **options).on_device(left, right, stream=0)
+    result = Matcher("S2", device="cuda", **options).on_device(left, right, stream=0)
     want = Matcher("S2", device="cpu", **options)(left, right)
-    np.testing.assert_array_equal(found.disparity, want.disparity)
-    np.testing.assert_array_equal(found.valid != 0, want.valid)
-    np.testing.assert_array_equal(found.confidence, want.confidence)
-    np.testing.assert_array_equal(found.right, want.right)
+    np.testing.assert_array_equal(result.disparity, want.disparity)
+    np.testing.assert_array_equal(result.valid != 0, want.valid)
+    np.testing.assert_array_equal(result.confidence, want.confidence)
+    np.testing.assert_array_equal(result.right, want.right)
 
 
 @pytest.mark.parametrize("refiner", ["linear", "cnn", "pyramid"])
@@ -172,19 +172,19 @@ def test_images_of_the_device_at_half_size(host_as_device, refiner):
     pytest.importorskip("torch")
     pair = _pair(9, 27)
     options = {**LEVELS, "scale": 0.5, "refiner": refiner, "right": True, "confidence": refiner != "cnn"}
-    found = Matcher("S2", device="cuda", **options).on_device(*pair, stream=0)
     if refiner != "linear":
         pytest.importorskip("stereokit_kitti_weights")
         options["weights"] = "kitti"
+    result = Matcher("S2", device="cuda", **options).on_device(*pair, stream=0)
     exact = {} if refiner == "linear" else {"backend": "torch"}
     want = Matcher("S2", device="cpu", **options, **exact)(*pair)
     for name in ("disparity", "right"):
-        np.testing.assert_allclose(getattr(found, name), getattr(want, name), rtol=0, atol=2e-3)
-    np.testing.assert_array_equal(np.asarray(found.valid) != 0, want.valid)
+        np.testing.assert_allclose(getattr(result, name), getattr(want, name), rtol=0, atol=2e-3)
+    np.testing.assert_array_equal(np.asarray(result.valid) != 0, want.valid)
     if refiner == "cnn":
-        assert found.confidence is None
+        assert result.confidence is None
     else:
-        np.testing.assert_allclose(found.confidence, want.confidence, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(result.confidence, want.confidence, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("low", [5, -7])
@@ -196,10 +196,10 @@ def test_nothing_lies_below_an_odd_minimum_at_half_size(host_as_device, low):
     want = Matcher("S2", device="cpu", **options)(*pair)
     matcher = Matcher("S2", device="cuda", **options)
     np.testing.assert_array_equal(matcher(*pair).disparity, want.disparity)
-    found = matcher.on_device(*pair, stream=0)
+    result = matcher.on_device(*pair, stream=0)
     for name in ("disparity", "right"):
-        assert getattr(want, name).min() == getattr(found, name).min() == low
-        np.testing.assert_allclose(getattr(found, name), getattr(want, name), rtol=0, atol=2e-3)
+        assert getattr(want, name).min() == getattr(result, name).min() == low
+        np.testing.assert_allclose(getattr(result, name), getattr(want, name), rtol=0, atol=2e-3)
 
 
 def test_refiners_of_the_host_are_not_for_the_device(queues, monkeypatch):

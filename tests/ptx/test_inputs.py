@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ptx import bodies_inputs as bodies
-from ptx.emulated import EmulatedQueue
+from ptx.checks import inputs as checks
+from ptx.interpreter.emulated import EmulatedQueue
 from stereokit.images.prepare_cuda import gaussian_weights
 
 SEEDS = [None, 1, 2, 3]
@@ -16,7 +16,7 @@ TYPES = [np.uint8, np.uint16]
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize("check", [bodies.check_grey, bodies.check_mirrored, bodies.check_halved, bodies.check_ranges])
+@pytest.mark.parametrize("check", [checks.check_grey, checks.check_mirrored, checks.check_halved, checks.check_ranges])
 def test_integers(check, dtype, seed):
     check(EmulatedQueue(seed), dtype)
 
@@ -24,12 +24,12 @@ def test_integers(check, dtype, seed):
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("dtype", TYPES)
 def test_gaussian(dtype, seed):
-    bodies.check_blurred(EmulatedQueue(seed), dtype, (0.3, 0.7, 2.0) if seed is None else (0.3, 0.4, 0.5))
+    checks.check_blurred(EmulatedQueue(seed), dtype, (0.3, 0.7, 2.0) if seed is None else (0.3, 0.4, 0.5))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_flip(seed):
-    bodies.check_flipped(EmulatedQueue(seed))
+    checks.check_flipped(EmulatedQueue(seed))
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.5, 0.6, 0.7, 1.0, 2.5, 10.0])

@@ -1,12 +1,12 @@
-"""The interpreter itself: what instructions compute, and that each kind of failure is found and named."""
+"""The interpreter itself: results of instructions, and every kind of failure by its name."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from ptx import errors
-from ptx.harness import Buffer, run
+from ptx.interpreter import errors
+from ptx.interpreter.harness import Buffer, run
 
 _REGISTERS = ".reg .pred %p<9>; .reg .b16 %rs<9>; .reg .b32 %r<40>; .reg .f32 %f<9>; .reg .b64 %rd<20>;"
 _OWN = """
@@ -28,7 +28,7 @@ def program(body, shared=0):
 
 
 def apply(body, values, dtype=np.uint32):
-    """Return what ``%r5 -> %r6`` makes of each value."""
+    """Return the result of ``%r5 -> %r6`` for each value."""
     values = np.asarray(values, dtype)
     values = np.resize(values, -(-values.size // 32) * 32)
     out = np.zeros(values.size, np.uint32)

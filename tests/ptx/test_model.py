@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ptx.emulated import EmulatedQueue
-from ptx.harness import Report, translation_of
+from ptx.interpreter.emulated import EmulatedQueue
+from ptx.interpreter.harness import Report, translation_of
 from stereokit import Matcher
 from stereokit.cuda.pipeline import CudaPipeline
 from stereokit.defaults import METHODS
@@ -34,10 +34,10 @@ class _Queue(EmulatedQueue):
 
     def __init__(self) -> None:
         super().__init__()
-        self.given: list[tuple[Any, int, Any]] = []
+        self.records: list[tuple[Any, int, Any]] = []
 
     def launch(self, what: Any, blocks: int, *arguments: Any) -> None:
-        self.given.append((what, blocks, named(what, arguments)))
+        self.records.append((what, blocks, named(what, arguments)))
         super().launch(what, blocks, *arguments)
 
 
@@ -62,7 +62,7 @@ def launches(request) -> tuple[Matcher, list[tuple[Any, int, Any, Report]]]:
     images = queue.upload("images", np.stack([left, np.roll(left, -4, axis=1)]))
     pipeline = CudaPipeline(matcher.settings)
     pipeline.run(queue, images, left.dtype, images[: left.size], None, left.shape)
-    return matcher, [(*given, ran[2]) for given, ran in zip(queue.given, queue.launches, strict=True)]
+    return matcher, [(*record, ran[2]) for record, ran in zip(queue.records, queue.launches, strict=True)]
 
 
 def test_bytes_are_those_that_threads_ask_for(launches):
@@ -86,9 +86,9 @@ def test_instructions_are_those_of_the_warps(launches):
 def test_the_recorder_sees_the_same_launches(launches):
     matcher, ran = launches
     _, height, width, _ = MATCHES[next(short for short, name in METHODS.items() if name == matcher.method)]
-    found = record(matcher, width, height)
-    assert [(one.kernel, one.blocks) for one in found] == [(kernel, blocks) for kernel, blocks, _, _ in ran]
-    for one, (kernel, blocks, arguments, _) in zip(found, ran, strict=True):
+    work = record(matcher, width, height)
+    assert [(one.kernel, one.blocks) for one in work] == [(kernel, blocks) for kernel, blocks, _, _ in ran]
+    for one, (kernel, blocks, arguments, _) in zip(work, ran, strict=True):
         asked = work_of(kernel, blocks, arguments)
         assert one.work == asked
         assert 0 < one.read <= sum(asked.reads.values()) and one.written <= sum(asked.writes.values())

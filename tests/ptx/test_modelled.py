@@ -78,17 +78,17 @@ def test_the_bytes_of_the_page_are_those_of_the_model():
             volumes = libsgm_bytes(match.pixels, match.levels, paths)
             shares[f"{short} {size}"] = match.of_libsgm, match.moved / volumes
     figures = r"modelled at ([\d.]+) \(Census\) and ([\d.]+) \(ZNCC\).*?it is ([\d.]+) and ([\d.]+) times"
-    told = [float(figure) for figure in re.search(figures, TEXT, re.S).groups()]
+    documented = [float(figure) for figure in re.search(figures, TEXT, re.S).groups()]
     ours = [shares[key][which] for which in (0, 1) for key in ("S2 full", "S4 full")]
-    assert told == pytest.approx(ours, abs=0.006)
+    assert documented == pytest.approx(ours, abs=0.006)
 
 
 def test_the_text_of_the_page_gives_the_goals_figures():
     figures = r"modelled at ([\d.]+) ms there, and at ([\d.]+) ms\s+with twice the bounds"
-    told = [float(figure) for figure in re.search(figures, TEXT).groups()]
+    documented = [float(figure) for figure in re.search(figures, TEXT).groups()]
     match = half_size()
     twice = sum(2 * time.ms - time.launch for time in match.times["AGX Xavier"])
-    assert told == pytest.approx([match.ms("AGX Xavier"), twice], rel=0.15)
+    assert documented == pytest.approx([match.ms("AGX Xavier"), twice], rel=0.15)
 
 
 def test_every_table_of_the_page_says_modelled():

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from ptx import bodies_post as bodies
-from ptx.emulated import EmulatedQueue
+from ptx.checks import post as checks
+from ptx.interpreter.emulated import EmulatedQueue
 
-CHECKS = [getattr(bodies, name) for name in sorted(vars(bodies)) if name.startswith("check_")]
+CHECKS = [getattr(checks, name) for name in sorted(vars(checks)) if name.startswith("check_")]
 SMALL = [(5, 33), (2, 40)]
 
 
@@ -19,4 +19,4 @@ def test_in_lockstep(check):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("name", ["check_smp", "check_speckle", "check_fill", "check_median"])
 def test_in_any_order(name, seed):
-    getattr(bodies, name)(EmulatedQueue(seed), SMALL)
+    getattr(checks, name)(EmulatedQueue(seed), SMALL)

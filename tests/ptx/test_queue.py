@@ -32,7 +32,7 @@ class _Array:
 
 
 class _Cuda:
-    """What the queue uses of numba.cuda; `log` tells what it did."""
+    """The part of numba.cuda that the queue uses; `log` lists the calls."""
 
     def __init__(self, room: int = 10**9) -> None:
         self.log: list[str] = []
@@ -61,9 +61,9 @@ class _Cuda:
 
 @pytest.fixture
 def fake(monkeypatch):
-    held = _Cuda()
-    monkeypatch.setattr(stream, "cuda", held)
-    return held
+    fake = _Cuda()
+    monkeypatch.setattr(stream, "cuda", fake)
+    return fake
 
 
 def test_arrays_stay_until_size_or_type_change(fake):
@@ -100,32 +100,32 @@ def test_an_upload_waits_only_for_the_last_one_of_its_name(fake):
     values = np.arange(6, dtype=np.int32).reshape(2, 3)
     queue.upload("a", values)
     assert "wait for copy" not in fake.log
-    held = queue.upload("a", values + 1)
-    np.testing.assert_array_equal(held.values, values.ravel() + 1)
+    array = queue.upload("a", values + 1)
+    np.testing.assert_array_equal(array.values, values.ravel() + 1)
     assert fake.log == ["allocate 6", "to device", "record", "wait for copy", "to device", "record"]
 
 
 def test_tables_are_uploaded_once_for_a_key(fake):
     queue = stream.DeviceQueue()
-    made: list[int] = []
+    calls: list[int] = []
 
     def make(value: int) -> Any:
-        made.append(value)
+        calls.append(value)
         return np.full((2, 2), value, np.int32)
 
     for value in (1, 1, 2, 2):
-        held = queue.once("table", value, lambda value=value: make(value))
-        np.testing.assert_array_equal(held.values, [value] * 4)
-    assert made == [1, 2]
+        array = queue.cached("table", value, lambda value=value: make(value))
+        np.testing.assert_array_equal(array.values, [value] * 4)
+    assert calls == [1, 2]
 
 
 def test_fetched_and_copied_arrays_are_the_callers(fake):
     queue = stream.DeviceQueue()
-    held = queue.upload("a", np.arange(5, dtype=np.float32))
-    fetched, copied = queue.fetch(held), queue.copy(held)
+    array = queue.upload("a", np.arange(5, dtype=np.float32))
+    fetched, copied = queue.fetch(array), queue.copy(array)
     assert "wait for stream" in fake.log
     queue.upload("a", np.zeros(5, np.float32))
-    queue.fetch(held)
+    queue.fetch(array)
     np.testing.assert_array_equal(fetched, np.arange(5))
     np.testing.assert_array_equal(copied.values, np.arange(5))
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from ptx import bodies_sgm as bodies
-from ptx.emulated import EmulatedQueue
+from ptx.checks import sgm as checks
+from ptx.interpreter.emulated import EmulatedQueue
 
 
 @pytest.mark.parametrize("seed", [None, 1, 2, 3])
-@pytest.mark.parametrize("check", [bodies.check_selection, bodies.check_selection_of_floats, bodies.check_doubt])
+@pytest.mark.parametrize(
+    "check", [checks.check_selection, checks.check_selection_of_floats, checks.check_zeroed_confidence]
+)
 def test_schedules(check, seed):
     check(EmulatedQueue(seed))
 
@@ -17,11 +19,11 @@ def test_schedules(check, seed):
 @pytest.mark.parametrize("floats", [False, True])
 @pytest.mark.parametrize("count", [1, 2, 3, 32, 33, 100, 130, 257])
 def test_levels(count, floats):
-    bodies.check_selection(EmulatedQueue(), floats, (3, 5), count, bands=(0, 5))
+    checks.check_selection(EmulatedQueue(), floats, (3, 5), count, bands=(0, 5))
 
 
 @pytest.mark.parametrize(
-    ("subpixel", "uniqueness", "confident"), [(False, 0.0, 0), (True, 0.0, 1), (True, 20.0, 0), (False, 20.0, 2)]
+    ("subpixel", "uniqueness", "detail"), [(False, 0.0, 0), (True, 0.0, 1), (True, 20.0, 0), (False, 20.0, 2)]
 )
-def test_rules(subpixel, uniqueness, confident):
-    bodies.check_selection(EmulatedQueue(), False, (4, 9), 12, subpixel, uniqueness, confident, (0, 1, 9))
+def test_rules(subpixel, uniqueness, detail):
+    checks.check_selection(EmulatedQueue(), False, (4, 9), 12, subpixel, uniqueness, detail, (0, 1, 9))

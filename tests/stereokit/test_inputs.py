@@ -141,9 +141,9 @@ def test_results_are_not_shared_with_later_calls():
     left, right = pair_of(seed=9)
     matcher = Matcher(METHOD, max_disparity=16, confidence=True, smp=False, median=0)
     first = matcher(left, right)
-    kept = first.disparity.copy(), first.valid.copy(), first.confidence.copy()
+    copies = first.disparity.copy(), first.valid.copy(), first.confidence.copy()
     matcher(right, left)
-    for array, copy in zip((first.disparity, first.valid, first.confidence), kept, strict=True):
+    for array, copy in zip((first.disparity, first.valid, first.confidence), copies, strict=True):
         np.testing.assert_array_equal(array, copy)
     assert first.disparity.flags.writeable
     assert not np.shares_memory(first.disparity, left)
@@ -301,8 +301,8 @@ BAD_OPTIONS = [
     ({"median": 4}, ["median", "4"]),
     ({"median": [3]}, ["median", "[3]"]),
     ({"median": "wide"}, ["median", "wide"]),
-    ({"outside": 1.5}, ["outside", "1.5"]),
-    ({"outside": float("nan")}, ["outside", "nan"]),
+    ({"border_cost": 1.5}, ["border_cost", "1.5"]),
+    ({"border_cost": float("nan")}, ["border_cost", "nan"]),
     ({"nodata": "none"}, ["nodata", "number", "none"]),
     ({"nodata": True}, ["nodata", "True"]),
     ({"smooth": -1}, ["smooth", "0 to 10", "-1"]),
@@ -380,7 +380,7 @@ def test_methods_that_do_not_exist(method, words):
 
 def test_numbers_of_numpy_are_numbers():
     numbers = {"max_disparity": np.int64(16), "window": np.int32(5), "steps": np.uint8(63)}
-    assert Matcher("zncc+sgm", **numbers, p1=np.float32(0.5), outside=np.float64(0.5)).max_disparity == 16
+    assert Matcher("zncc+sgm", **numbers, p1=np.float32(0.5), border_cost=np.float64(0.5)).max_disparity == 16
     assert Matcher("zncc+dt", **numbers, sigma_s=np.float32(9), passes=np.int64(1)).max_disparity == 16
 
 
@@ -400,7 +400,7 @@ def test_a_wrong_type_is_refused_even_if_an_equal_value_was_used_before(options)
         lambda: stereokit.cost_volume(A, A, None),
         lambda: stereokit.cost_volume(A, A, "census", steps=3),
         lambda: stereokit.cost_volume(A, A, "census", max_disparity=0),
-        lambda: stereokit.cost_volume(A, A, "census", outside=2),
+        lambda: stereokit.cost_volume(A, A, "census", border_cost=2),
         lambda: stereokit.cost_volume(A, A, "census", threads=0),
         lambda: stereokit.aggregate(np.zeros((4, 5, 3), np.uint8), A, "bilateral"),
         lambda: stereokit.aggregate(np.zeros((4, 5, 3), np.uint8), A, None),

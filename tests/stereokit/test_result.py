@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
@@ -101,9 +102,9 @@ def test_bad_ranges_and_maps_are_refused():
 
 def test_inputs_stay_as_they_are():
     strided = np.tile(MAP, (2, 2))[::2, ::-1]
-    kept = strided.copy()
+    original = strided.copy()
     colorize(strided)
-    np.testing.assert_array_equal(strided, kept)
+    np.testing.assert_array_equal(strided, original)
 
 
 def test_numpy_takes_a_result_as_its_map():
@@ -159,3 +160,12 @@ def test_a_png_refuses_what_it_cannot_say(tmp_path, value):
         write(tmp_path / "a.pfm")
         np.testing.assert_array_equal(io.read_disparity(tmp_path / "a.pfm"), values)
         (tmp_path / "a.pfm").unlink()
+
+
+def test_a_notebook_shows_the_map_in_colours():
+    """The picture is `color`, whatever has no value black."""
+    disparity = np.array([[1, 2, np.nan], [4, 8, 16]], np.float32)
+    result = Disparity(disparity, np.isfinite(disparity))
+    picture = cv2.imdecode(np.frombuffer(result._repr_png_(), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+    assert np.array_equal(picture, result.color())
+    assert not picture[0, 2].any()

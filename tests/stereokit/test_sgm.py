@@ -16,10 +16,10 @@ def cost_of(largest):
     return RowCost(lambda *_: None, largest)
 
 
-class Dear(RowCost):
+class CostlyCost(RowCost):
     """A cost that the second sweep takes back from the path costs of the first."""
 
-    dear = True
+    costly_to_recompute = True
 
 
 def volume_of(shape, count, largest, seed=0):
@@ -70,7 +70,7 @@ def test_costs_that_are_recovered_are_those_that_were_computed(shape, count, lar
     expected = oracles.sgm(volume, p1, p2, oracles.DIRECTIONS[4], guide, 8, 0.5)
     for threads in (1, 2):
         options = {"p1": p1, "p2": p2, "edge": 8, "edge_factor": 0.5, "threads": threads}
-        total = aggregate(volume, guide, "sgm", cost=Dear(lambda *_: None, largest), **options)
+        total = aggregate(volume, guide, "sgm", cost=CostlyCost(lambda *_: None, largest), **options)
         np.testing.assert_array_equal(total, expected)
 
 

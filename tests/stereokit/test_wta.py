@@ -7,7 +7,7 @@ import oracles
 import pytest
 
 from stereokit import InputError, select
-from stereokit.selection.wta import keys_of, select_row, winners_like
+from stereokit.selection.wta import keys_of, select_row, selection_output
 
 TYPES = [np.uint16, np.int16, np.float32]
 
@@ -83,7 +83,7 @@ def test_candidates_are_the_winner_and_its_best_rival(dtype, count, high, unique
     values[:, :, :count] = volume
     disparity, confidence = np.empty((2, 4, 5), np.float32)
     cost, candidates = np.empty((4, 5), dtype), np.full((2, 4, 5), -99, np.float32)
-    out = winners_like(disparity, cost, confidence, count, -7, True, uniqueness, candidates)
+    out = selection_output(disparity, cost, confidence, count, -7, True, uniqueness, candidates)
     for y in range(4):
         row = values[y].ravel()
         select_row(keys_of(row), row, 5, tuple(range(padded // 64)), 5 * y, out)

@@ -1,7 +1,6 @@
 """A stereo video as pairs: left and right side by side in one file, or one file for each camera; OpenCV decodes.
 
-Frames are named by their number. They come one at a time and in order; those that are not wanted are passed over
-without being turned into pictures.
+Frames are named by their number. They come one at a time and in order; unwanted frames are skipped without decoding.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class FramePair:
-    """One frame: its name and two images, (H, W, 3) uint8 RGB, or why there is none."""
+    """One frame: its name and two images, (H, W, 3) uint8 RGB, or the reason why there is none."""
 
     name: str
     left: Image | None
@@ -66,20 +65,22 @@ class Video:
             raise InputError(f"the two videos must have the same size, got {texts}")
         if right is None and sizes[0][0] % 2:
             raise InputError(f"a video with both views side by side must have an even width, got {sizes[0][0]}")
-        self.expected: int | None = min(counts) if min(counts) > 0 else None  # what the files say; it may be wrong
+        self.expected: int | None = (
+            min(counts) if min(counts) > 0 else None
+        )  # by the files' headers, which may be wrong
 
     def frames(self, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[FramePair]:
-        """Yield the frames whose names are wanted; where one of two videos ends early, a last one says so."""
+        """Yield the frames whose names are wanted; where one of two videos ends early, a last one has the reason."""
         captures = [_open(path) for path in self.paths]
         try:
             number = 0
             while True:
                 name = f"{number:06d}"
                 with quiet_decoders():
-                    there = [capture.grab() for capture in captures]
-                if not all(there):
-                    if any(there):
-                        side = "left" if not there[0] else "right"
+                    grabbed = [capture.grab() for capture in captures]
+                if not all(grabbed):
+                    if any(grabbed):
+                        side = "left" if not grabbed[0] else "right"
                         yield FramePair(name, None, None, f"the {side} video ends before the other")
                     return
                 if wanted(name):

@@ -1,8 +1,8 @@
 """The command ``stereokit batch``: maps of all pairs of a folder, a list or a video, on this machine or on a cluster.
 
-What is there already is left alone, so that the same command goes on after an interrupt, a kill or a full disk. A pair
-that fails is named and costs nobody else anything. For scripts there is `stereokit_evaluation.batch.run.run_batch`;
-what a folder and a list may look like is told in `stereokit_evaluation.batch.pairs`.
+Existing maps stay, so that the same command resumes after an interrupt, a kill or a full disk. A pair that fails is
+named, and the others go on. For scripts there is `stereokit_evaluation.batch.run.run_batch`; the formats of folders and
+lists are in `stereokit_evaluation.batch.pairs`.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.cli.output import Table
+from stereokit.cli.rig import AlphaOption, RigOption, rig_files
 from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES
 from stereokit_evaluation.batch.job import Job, matcher_of
-from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
+from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, PairFiles, folder_pairs, folders_pairs, list_pairs
 from stereokit_evaluation.batch.run import Engine, Summary, identity, on_threads, run_batch
 from stereokit_evaluation.batch.store import write_document
 from stereokit_evaluation.batch.video import Video
@@ -66,6 +67,8 @@ def batch(
     settings: SettingsOption = None,
     file_format: Annotated[str, typer.Option("--format", help="png (KITTI), pfm, npy or tiff.")] = "png",
     color: Annotated[bool, typer.Option("--color", help="Also coloured pictures, in DIR/color.")] = False,
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     pattern: Annotated[
         tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Files of a folder, '*_l.png' '*_r.png'.")
     ] = None,
@@ -75,12 +78,12 @@ def batch(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Make all maps anew.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Match all pairs of a folder, a list or a video; go on where an earlier run ended.
+    """Match all pairs of a folder, a list or a video; resume where an earlier run ended.
 
     A folder has left and right, or image_2 and image_3, or files NAME_left and NAME_right, or others by --pattern; a
-    list has lines left,right[,name]; a video has both views side by side, or is two files. Maps that are there are not
-    made again, and must come from the same inputs and options. Pairs that fail are named, and the exit status is then
-    1.
+    list has lines left,right[,name]; a video has both views side by side, or is two files. Existing maps stay,
+    and must come from the same inputs and options. Pairs that fail are named, and the exit status is then 1.
+    With --rig the images are raw ones, and are rectified first.
     """
     check_json(json_file)
     if file_format not in _FORMATS:
@@ -88,8 +91,8 @@ def batch(
     if file_format == "png":
         check_fits_png("--format png", min_disparity, max_disparity)
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
-    given = {"refiner": refiner, "weights": weights, "fill": fill}
-    options.update({name: value for name, value in given.items() if value is not None})
+    user_options = {"refiner": refiner, "weights": weights, "fill": fill}
+    options.update({name: value for name, value in user_options.items() if value is not None})
     options["device"] = device
     options.update(parse_settings(settings or (), _OWN_OPTIONS))
     for name in ("right", "confidence"):
@@ -99,9 +102,12 @@ def batch(
         options["refiner"] = os.path.abspath(refiner)
     if weights is not None and weights.endswith(".safetensors"):
         options["weights"] = os.path.abspath(weights)
-    where = os.path.abspath(output)
-    job = Job(where, f".{file_format}", color, method, tuple(sorted(options.items())))
-    matcher_of(job)  # refuses what cannot be
+    folder = os.path.abspath(output)
+    if alpha is not None and rig is None:
+        raise OptionError("--alpha is for --rig")
+    raw = () if rig is None else tuple(os.path.abspath(path) for path in rig_files(rig))
+    job = Job(folder, f".{file_format}", color, method, tuple(sorted(options.items())), raw, alpha)
+    matcher_of(job)  # refuses bad options
     run_on, engine_options, client = _engine(engine, scheduler, workers)
     try:
         source, origin = find_pairs(inputs, pattern)
@@ -112,15 +118,17 @@ def batch(
             client.close()
     if isinstance(source, Video) and source.expected and summary.pairs < source.expected and not summary.interrupted:
         summary.notes.append(f"the video says {source.expected} frames, {summary.pairs} could be read")
-    document = {**summary.as_json(), "output": where, **engine_options, "options": identity(job, origin)}
-    if Path(where).is_dir() and not summary.vanished:
-        write_document(Path(where) / "summary.json", document)
+    document = {**summary.as_json(), "output": folder, **engine_options, "options": identity(job, origin)}
+    if Path(folder).is_dir() and not summary.vanished:
+        write_document(Path(folder) / "summary.json", document)
     printed = write_json(json_file, document)
     _finish(summary, job, printed)
 
 
-def find_pairs(inputs: Sequence[Path], pattern: tuple[str, str] | None = None) -> tuple[list[Pair] | Video, list[str]]:
-    """Return the pairs that the inputs of the command have, and what a manifest calls the inputs.
+def find_pairs(
+    inputs: Sequence[Path], pattern: tuple[str, str] | None = None
+) -> tuple[list[PairFiles] | Video, list[str]]:
+    """Return the pairs of the command's inputs, and the names of the inputs in a manifest.
 
     Parameters
     ----------
@@ -184,32 +192,35 @@ def _engine(name: str, scheduler: str | None, workers: int | None) -> tuple[Engi
 
 
 def _run(
-    job: Job, source: list[Pair] | Video, run_on: Engine, origin: list[str], overwrite: bool, total: int | None
+    job: Job, source: list[PairFiles] | Video, run_on: Engine, origin: list[str], overwrite: bool, total: int | None
 ) -> Summary:
-    seen = told = doubted = 0
+    pair_count = error_count = warning_count = 0
     with progress(total) as (console, step):
 
-        def tell(line: str) -> None:
+        def report(line: str) -> None:
             console.print(one_line(line), markup=False, highlight=False, soft_wrap=True)
 
         def show(summary: Summary) -> None:
-            nonlocal seen, told, doubted
-            for name, reason in summary.errors[told:_SHOWN_ERRORS]:
-                tell(f"failed {name}: {reason}")
-                told += 1
-            for name, line in summary.doubts[doubted:_SHOWN_ERRORS]:
-                tell(f"warning: {name}: {line}")
-                doubted += 1
+            nonlocal pair_count, error_count, warning_count
+            for name, reason in summary.errors[error_count:_SHOWN_ERRORS]:
+                report(f"failed {name}: {reason}")
+                error_count += 1
+            for name, line in summary.warnings[warning_count:_SHOWN_ERRORS]:
+                report(f"warning: {name}: {line}")
+                warning_count += 1
             rate = summary.pairs_per_second
-            step("" if rate is None else f"{rate:.1f} pairs/s", summary.pairs - seen)
-            seen = summary.pairs
+            step("" if rate is None else f"{rate:.1f} pairs/s", summary.pairs - pair_count)
+            pair_count = summary.pairs
 
         summary = run_batch(job, source, run_on, inputs=origin, overwrite=overwrite, progress=show)
-        for what, count in (("failed", len(summary.errors) - told), ("doubtful", len(summary.doubts) - doubted)):
+        for kind, count in (
+            ("failed", len(summary.errors) - error_count),
+            ("doubtful", len(summary.warnings) - warning_count),
+        ):
             if count > 0:
-                tell(f"... and {count} more {what}, all in summary.json")
+                report(f"... and {count} more {kind}, all in summary.json")
         if summary.interrupted:
-            tell("interrupted: the same command goes on from here")
+            report("interrupted: the same command goes on from here")
     return summary
 
 
@@ -221,7 +232,7 @@ def _finish(summary: Summary, job: Job, printed: bool) -> None:
         for head in ("method", "pairs", "written", "there before", "failed", "seconds", "pairs/s"):
             table.add_column(head, justify="left" if head == "method" else "right", no_wrap=True)
         rate = summary.pairs_per_second
-        counts = (summary.pairs, summary.written, summary.found, summary.failed)
+        counts = (summary.pairs, summary.written, summary.existing, summary.failed)
         seconds = f"{summary.seconds:.1f}", "-" if rate is None else f"{rate:.2f}"
         table.add_row(matcher_of(job).method, *map(str, counts), *seconds)
         Console(width=None if sys.stdout.isatty() else 120).print(table)

@@ -41,7 +41,7 @@ def photograph(name: str) -> Bytes:
         from skimage import data
     except ImportError as error:
         raise StereokitError(
-            "synthetic scenes need scikit-image's photographs; pip install stereokit[evaluation]"
+            "synthetic scenes need scikit-image's photographs; pip install stereokit[scenes]"
         ) from error
     image: Bytes = np.ascontiguousarray(getattr(data, name)(), np.uint8)
     image.setflags(write=False)

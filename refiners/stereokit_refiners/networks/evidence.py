@@ -4,8 +4,9 @@ For each full-size pixel there are seven values to choose from, `VALUES`: the co
 little less and a little more, the smallest and the largest coarse value nearby, and the matcher's two candidates. For
 each of them the images say how well it fits: the Hamming distance of census transforms at full size
 (`stereokit_refiners.runtimes.evidence`). The output is a weighted mean of the values; a weight's logit is what the
-network says for the place, plus a gain, also the network's, times the evidence at the very pixel. So context of some
-hundred pixels, at a quarter of the size, decides together with evidence at full size.
+network says for the place, plus gains, also the network's, times the evidence right there, averaged over a small window
+and a larger one. So context of some hundred pixels, at a quarter of the size, decides together with evidence. Weights
+stand for 2x2 pixels each.
 
 Nothing that the network sees depends on the size of the disparities or on the grey level, only on differences: adding
 a constant to all disparities adds it to the output.
@@ -22,10 +23,13 @@ from typing import Any, ClassVar
 from stereokit_refiners.networks.layers import Layer, Ops
 from stereokit_refiners.outputs import Output
 
-__all__ = ["CHANNELS", "GAINS", "LOGITS", "VALUES", "Evidence"]
+__all__ = ["CHANNELS", "GAINS", "LOGITS", "STEPS", "VALUES", "WINDOWS", "Evidence"]
 
 VALUES = ("coarse", "less", "more", "lowest", "highest", "candidate", "rival")
 """What a pixel chooses from. The logit of the first is 0."""
+
+STEPS = 40
+"""Steps of the network's input to a unit. It comes in bytes, and weights are for these."""
 
 CHANNELS = {
     "grey": 16,  # locally normalised, by pixel of the 4x4
@@ -34,20 +38,23 @@ CHANNELS = {
     "values": 16,  # the last four of `VALUES` less the coarse map
     "cost": 4,  # of the coarse map
     "gain": 24,  # how much less the others cost
+    "surface": 20,  # what the right view has where a value points to, less the value: `VALUES` but "less" and "more"
     "outside": 1,  # share of the coarse matches outside the right image
     "scale": 1,  # at which was matched
-    "surface": 20,  # what the right view has where a value points to, less the value: `VALUES` but "less" and "more"
 }
 """Channels of the network's input, at a quarter of the size."""
+
+WINDOWS = (3, 7)
+"""Sides of the windows over which evidence is averaged, in 2x2 pixels."""
 
 LOGITS = 4 * (len(VALUES) - 1)
 """Channels of the head that are logits: value by value, each by 2x2 of the 4x4."""
 
-GAINS = 2
-"""Then come the gains of the evidence, for "less" and "more" and for the others; and last four logits of how sure the
-result is, by 2x2 of the 4x4."""
+GAINS = 2 * len(WINDOWS)
+"""Then come the gains of the evidence: for each window that for "less" and "more", and that for the others. Last come
+four logits of how sure the result is, by 2x2 of the 4x4."""
 
-_A, _B, _C, _D = 16, 32, 48, 64
+_A, _B, _C, _D = 16, 24, 48, 64
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class Evidence:
         Layer("up_2", _C, _B, kernel=1),
         Layer("merge_1", _B, _B, kernel=3),
         Layer("up_1", _B, _A, kernel=1),
-        Layer("merge_0", _A, _A, kernel=3),
+        Layer("merge_0", _A, _A, kernel=1),
         Layer("head", _A, LOGITS + GAINS + 4, kernel=1),
     )
     inputs: ClassVar[dict[str, int]] = {"evidence": sum(CHANNELS.values())}

@@ -154,7 +154,7 @@ def map_graph(network: Network, weights: Weights, output_mode: str) -> bytes:
 
 def session(
     network: Network, weights: Weights, threads: int
-) -> Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]:
+) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
     """Return a function from (C, h, w) inputs to the (h, w, C) head that ONNX Runtime computes."""
     import onnxruntime
 
@@ -165,8 +165,8 @@ def session(
     graph = head_graph(network, weights)
     model = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
-    def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-        feeds = {name: np.ascontiguousarray(inputs[name][None]) for name in network.inputs}
+    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+        feeds = {name: np.ascontiguousarray(inputs[name][None], np.float32) for name in network.inputs}
         return np.ascontiguousarray(model.run(["head"], feeds)[0][0])
 
     return run

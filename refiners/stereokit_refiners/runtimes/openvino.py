@@ -3,8 +3,8 @@
 The graph is built from the network's own description; transposed convolutions stand in their sub-pixel form, which
 is several times faster and equal up to rounding. For int8, each activation that calibration found ranges for passes
 through one FakeQuantize node where it is made, and the weights of the convolutions that read it through another;
-OpenVINO turns these into integer kernels. Inputs of the network stay in floating point: 8 bits would be too coarse for
-a disparity.
+OpenVINO turns these into integer kernels. Inputs of the network stay in floating point, since 8 bits would be too
+coarse for a disparity, unless they come in bytes: with their channels innermost.
 
 Channels differ in range by a factor of ten and more, and one scale for all would leave the small ones a few steps of
 the 256. A leaky ReLU commutes with positive factors, so each channel is brought to the range 1 where it is made, by
@@ -88,6 +88,13 @@ class _OpenVinoOps:
     def repeat(self, x: Any) -> Any:
         return self._doubled(x, mode="nearest", coordinate_transformation_mode="asymmetric", nearest_mode="floor")
 
+    def bytes(self, x: Any) -> Any:
+        """Return a node of bytes as what it is: numbers, 8 bits each."""
+        ends = _const(-128), _const(127)
+        y = op.fake_quantize(op.convert(x, "f32"), *ends, *ends, 256)
+        self.scales[id(y)] = y, np.ones(x.get_output_shape(0)[1], np.float32)
+        return y
+
     def _doubled(self, x: Any, mode: str, **attributes: str) -> Any:
         rows, columns = x.get_output_shape(0)[2:]
         sizes = op.constant(np.array([2 * rows, 2 * columns], np.int64))
@@ -165,9 +172,12 @@ def build(network: Network, weights: Weights, rows: int, columns: int, ranges: R
     parameters, inputs = {}, {}
     for name, channels in network.inputs.items():
         size = [1, rows, columns, channels] if network.innermost else [1, channels, rows, columns]
-        parameters[name] = inputs[name] = op.parameter(size, np.float32, name=name)
+        whole = network.innermost and bool(ranges)
+        parameters[name] = inputs[name] = op.parameter(size, np.int8 if whole else np.float32, name=name)
         if network.innermost:
             inputs[name] = op.transpose(parameters[name], op.constant(np.array([0, 3, 1, 2], np.int64)))
+        if whole:
+            inputs[name] = ops.bytes(inputs[name])
     head = network.forward(ops, inputs)["map"]
     head = op.transpose(head, op.constant(np.array([0, 2, 3, 1], np.int64)))  # the layout that it has in memory
     return ov.Model([op.result(head)], list(parameters.values()), network.name)
@@ -181,7 +191,7 @@ def _core() -> ov.Core:
 def compiled(
     network: Network, weights: Weights, rows: int, columns: int, threads: int, precision: str,
     ranges: Ranges | None,
-) -> Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]:  # fmt: skip
+) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:  # fmt: skip
     """Compile for a size; return a function from (C, h, w) inputs to the (h, w, C) head, safe to call in parallel.
 
     With one thread a call, as many calls run side by side as there are processors; with more, one call uses them all.
@@ -205,12 +215,14 @@ def compiled(
 
     requests: Pool[Any] = Pool(request)
 
-    def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
         with requests.take() as free:
-            arrays = [inputs[name][None] for name in network.inputs]
             if network.innermost:
-                arrays = [np.ascontiguousarray(np.moveaxis(each, 1, 3)) for each in arrays]
-            free.infer(arrays, share_inputs=True)
+                for k, name in enumerate(network.inputs):
+                    np.copyto(free.get_input_tensor(k).data[0], np.moveaxis(inputs[name], 0, 2))
+                free.infer()
+            else:
+                free.infer([inputs[name][None] for name in network.inputs], share_inputs=True)
             return np.array(free.get_output_tensor().data[0])
 
     return run

@@ -99,9 +99,10 @@ def _shuffled(x: Array) -> Array:
     return np.asarray(phases.reshape(channels, 2 * rows, 2 * columns), np.float32)
 
 
-def forward(network: Network, weights: Weights, inputs: dict[str, Array]) -> Array:
+def forward(network: Network, weights: Weights, inputs: dict[str, NDArray[Any]]) -> Array:
     """Return the (h, w, C) head for (C, h, w) inputs."""
-    head = network.forward(_PlainOps(network, weights), inputs)["map"]
+    given = {name: np.asarray(each, np.float32) for name, each in inputs.items()}
+    head = network.forward(_PlainOps(network, weights), given)["map"]
     return np.ascontiguousarray(head.transpose(1, 2, 0))
 
 
@@ -131,10 +132,11 @@ def _weighs(content: WeightFile) -> bool:
     return "evidence" in network_named(content.network).inputs
 
 
-def _prepared(content: WeightFile) -> tuple[dict[str, Array], Callable[[Array], Array]]:
+def _prepared(content: WeightFile) -> tuple[dict[str, NDArray[Any]], Callable[[Array], Array]]:
     """Return a network's inputs for the scene, and what makes a map of its head."""
     network, scene = network_named(content.network), _scene()
     rows, columns = (2 * length for length in SCENE_SIZE)
+    inputs: dict[str, NDArray[Any]]
     if not _weighs(content):
         rule = output_rule(network, content.output_mode)
         inputs = encode(tuple(network.inputs), rule.unit_inputs, **scene)
@@ -146,7 +148,7 @@ def _prepared(content: WeightFile) -> tuple[dict[str, Array], Callable[[Array], 
     return inputs, lambda head: mixture(head, found, rows, columns)[0]
 
 
-def mistake(content: WeightFile, run: Callable[[dict[str, Array]], Array]) -> float:
+def mistake(content: WeightFile, run: Callable[[dict[str, NDArray[Any]]], Array]) -> float:
     """Return how far a runtime's map of a small scene is off on average, full-size pixels; infinite if not a number.
 
     Parameters

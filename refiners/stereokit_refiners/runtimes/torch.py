@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -133,16 +134,16 @@ def _sub_pixel(weight: Tensor) -> Tensor:
 
 def runner(
     network: Network, arrays: Mapping[str, NDArray[np.float32]]
-) -> Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]:
+) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
     """Return a function from (C, h, w) inputs to the (h, w, C) head, on the GPU if torch has one."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     module = Module(network)
     module.load(arrays)
     module.to(device, memory_format=torch.channels_last).eval().requires_grad_(False)  # type: ignore[call-overload]
 
-    def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
         with torch.inference_mode():
-            tensors = {name: torch.from_numpy(inputs[name])[None].to(device) for name in network.inputs}
+            tensors = {name: torch.from_numpy(inputs[name])[None].to(device).float() for name in network.inputs}
             head = module(tensors)["map"][0].permute(1, 2, 0)
             return np.ascontiguousarray(head.cpu().numpy())
 

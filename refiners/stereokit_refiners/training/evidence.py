@@ -14,7 +14,7 @@ import argparse
 import os
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,28 +27,26 @@ from torch import Tensor
 
 import stereokit
 from stereokit.result import Disparity
-from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, VALUES, Evidence
+from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, STEPS, WINDOWS, Evidence
 from stereokit_refiners.runtimes.evidence import hypotheses, network_input
 from stereokit_refiners.runtimes.torch import Module, calibrate
-from stereokit_refiners.weights import WeightFile, write
+from stereokit_refiners.weights import WeightFile, read, write
 
 __all__ = ["fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
 
-_INPUT_STEPS = 40.0  # of the network's input, which lies between -3 and 3, in a byte
 _FIELDS: dict[str, tuple[int, Any]] = {
     "input": (sum(CHANNELS.values()), np.int8),
     "others": (16, np.float16),  # the last four values less the mean of the coarse map over 2x2
     "within": (16, np.float16),  # the coarse map less that mean, by pixel of the 4x4
-    "gain": (4 * LOGITS, np.int8),  # how much less the other values cost, by pixel of the 4x4
     "miss": (16, np.float16),  # truth less coarse map
     "kind": (16, np.uint8),  # 0 truth unknown, 1 seen by both cameras, 2 by the left one only
 }
 """What is stored of each 4x4 pixels."""
 
-_SCALE_CHANNEL = 69
+_FIRST = {name: sum(list(CHANNELS.values())[:k]) for k, name in enumerate(CHANNELS)}  # channel of the input
 _OCCLUDED = 0.3  # weight of pixels that the right camera does not see
 _HARM = 0.7  # how much more it counts to make a pixel worse than to make another one better by as much
-_TOO_HARD = 0.35  # samples with a larger share of outliers teach nothing
+_TOO_HARD = 0.25  # samples with a larger share of outliers teach nothing
 
 
 def _folded(plane: NDArray[Any], side: int) -> NDArray[Any]:
@@ -62,9 +60,7 @@ def packed(fields: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
     parts = []
     for name, (channels, dtype) in _FIELDS.items():
         array = fields[name]
-        if name == "input":
-            array = np.clip(np.rint(array * _INPUT_STEPS), -127, 127)
-        elif dtype == np.float16:
+        if dtype == np.float16:
             array = np.clip(array, -6e4, 6e4)
         moved = np.ascontiguousarray(array.transpose(1, 2, 0).astype(dtype))
         assert moved.shape[2] == channels
@@ -80,11 +76,6 @@ def unpacked(record: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         found[name] = np.ascontiguousarray(record[..., at : at + size]).view(dtype)
         at += size
     return found
-
-
-def _gains(means: NDArray[np.uint8]) -> NDArray[Any]:
-    gains = np.clip(means[:1].astype(np.int16) - means[1:], -127, 127)
-    return np.concatenate([_folded(gain, 4) for gain in gains])
 
 
 class _Keeper:
@@ -115,7 +106,6 @@ def make_sample(
     assert coarse.candidates is not None
     assert coarse.confidence is not None
     found = hypotheses(coarse.disparity, coarse.candidates, left, right, round(1 / scale))
-    half = np.mean([found.coarse[i::2, j::2] for i in (0, 1) for j in (0, 1)], axis=0)
     upscaled = (found.coarse + np.float32(found.base))[: left.shape[0], : left.shape[1]]
     miss = np.zeros(found.coarse.shape, np.float32)
     kind = np.zeros(found.coarse.shape, np.uint8)
@@ -124,9 +114,8 @@ def make_sample(
 
     fields = {
         "input": network_input(found, coarse.confidence, left, left.shape[1]),
-        "others": np.concatenate([_folded(values - half, 2) for values in found.others]),
-        "within": _folded(found.coarse - half.repeat(2, 0).repeat(2, 1), 4),
-        "gain": _gains(found.around),
+        "others": np.concatenate([_folded(values - found.half, 2) for values in found.others]),
+        "within": _folded(found.coarse - found.half.repeat(2, 0).repeat(2, 1), 4),
         "miss": _folded(miss, 4),
         "kind": _folded(kind, 4),
     }
@@ -167,7 +156,7 @@ def _store(pairs: Path, folder: Path, most: int) -> None:
     """Store up to `most` samples of each pair; those that are there are left as they are."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(most):
-        for path in sorted(pairs.glob("*.npz")):
+        for path in sorted(pairs.glob("*.npz"), key=lambda path: zlib.crc32(path.stem.encode())):  # kinds mixed
             if any(folder.glob(f"{path.stem}_{number:02d}_*.npy")):
                 continue
             rng = np.random.default_rng([number, zlib.crc32(path.stem.encode())])
@@ -188,35 +177,57 @@ def _store(pairs: Path, folder: Path, most: int) -> None:
             os.replace(part, name)
 
 
-def mixture(
-    head: Tensor, others: Tensor, within: Tensor, gain: Tensor, apart: Tensor
-) -> Tensor:  # fmt: skip
-    """Return the map less the coarse one, (B, 16, h, w): the twin of `stereokit_refiners.runtimes.mixture.mixture`.
+def gains_around(given: NDArray[np.int8]) -> NDArray[np.float32]:
+    """Return the means of the gains over each of `WINDOWS`, (N, h, w, 2 C), for stored inputs (N, h, w, C)."""
+    first = _FIRST["gain"]
+    gains = given[..., first : first + LOGITS].astype(np.float32)
+    count, height, width, _ = gains.shape
+    by_two = gains.reshape(count, height, width, -1, 2, 2).transpose(0, 1, 4, 2, 5, 3)
+    planes = np.ascontiguousarray(by_two).reshape(count, 2 * height, 2 * width, -1)
+    means = [
+        np.stack([cv2.blur(plane, (side, side), borderType=cv2.BORDER_REPLICATE) for plane in planes])
+        for side in WINDOWS
+    ]
+    return np.concatenate(means, 3)
+
+
+def mixture(head: Tensor, means: Tensor, others: Tensor, within: Tensor, apart: Tensor) -> Tensor:
+    """Return the map less the coarse one's mean over 2x2: the twin of `stereokit_refiners.runtimes.mixture.mixture`.
 
     Parameters
     ----------
     head : (B, C, h, w)
-    others, within, gain : (B, ., h, w)
+    means : (B, 2 C, 2h, 2w)
+        See `gains_around`.
+    others, within : (B, ., h, w)
         As they are stored.
     apart : (B,)
         How far "less" and "more" are from the coarse map, pixels.
+
+    Returns
+    -------
+    (B, 4h, 4w)
     """
-    batch, _, height, width = head.shape
-    count = len(VALUES) - 1
+    batch = len(head)
 
-    def by_pixel(x: Tensor) -> Tensor:
-        """Each of 2x2 four times: (B, 4n, h, w) -> (B, n, 16, h, w)."""
-        wide = x.view(batch, -1, 2, 1, 2, 1, height, width).expand(-1, -1, -1, 2, -1, 2, -1, -1)
-        return wide.reshape(batch, -1, 16, height, width)
+    def doubled(x: Tensor) -> Tensor:
+        rows, columns = x.shape[-2:]
+        wide = x[..., :, None, :, None].expand(*x.shape[:-2], rows, 2, columns, 2)
+        return wide.reshape(*x.shape[:-2], 2 * rows, 2 * columns)
 
-    gains = head[:, LOGITS : LOGITS + GAINS] / 16
-    per_value = torch.stack([gains[:, int(k >= 2)] for k in range(count)], 1)[:, :, None]
-    logits = by_pixel(head[:, :LOGITS]) + per_value * gain.view(batch, count, 16, height, width)
+    logits = F.pixel_shuffle(head[:, :LOGITS], 2)
+    count = logits.shape[1]
+    factors = doubled(head[:, LOGITS : LOGITS + GAINS] / 16)
+    for n in range(len(WINDOWS)):
+        mean = means[:, n * count : (n + 1) * count]
+        near, far = factors[:, 2 * n : 2 * n + 1], factors[:, 2 * n + 1 : 2 * n + 2]
+        logits = logits + torch.cat([near * mean[:, :2], far * mean[:, 2:]], 1)
     weights = logits.clamp(-40, 40).exp()
-    differences = by_pixel(others) - within[:, None]
-    more = apart.view(batch, 1, 1, 1, 1).expand(batch, 1, 16, height, width)
-    differences = torch.cat([-more, more, differences], 1)
-    return (weights * differences).sum(1) / (1 + weights.sum(1))
+    total = 1 + weights.sum(1)
+    share = (1 + weights[:, 0] + weights[:, 1]) / total
+    rest = (weights[:, 2:] * F.pixel_shuffle(others, 2)).sum(1)
+    rest = (rest + (weights[:, 1] - weights[:, 0]) * apart.view(batch, 1, 1)) / total
+    return doubled(share) * F.pixel_shuffle(within, 4)[:, 0] + doubled(rest)
 
 
 def _badness(error: Tensor) -> Tensor:
@@ -227,22 +238,18 @@ def _badness(error: Tensor) -> Tensor:
 
 def loss(head: Tensor, fields: dict[str, Tensor], apart: Tensor) -> tuple[Tensor, Tensor]:
     """Return the loss, and that of the coarse map alone."""
-    given = {name: fields[name].float() for name in ("others", "within", "gain")}
-    out = mixture(head, given["others"], given["within"], given["gain"], apart)
-    miss, kind = fields["miss"].float(), fields["kind"]
+    within = fields["within"].float()
+    out = mixture(head, fields["means"], fields["others"].float(), within, apart)
+    miss, kind = (F.pixel_shuffle(fields[name].float(), 4)[:, 0] for name in ("miss", "kind"))
     weight = (kind == 1).float() + _OCCLUDED * (kind == 2).float()
-    error = (out - miss).abs()
+    error = (out - F.pixel_shuffle(within, 4)[:, 0] - miss).abs()
     now, before = _badness(error), _badness(miss.abs())
     total = weight.sum().clamp(min=1)
     main = ((now + _HARM * F.relu(now - before)) * weight).sum() / total
-    batch, _, height, width = error.shape
-
-    def by_four(pixels: Tensor) -> Tensor:
-        return pixels.view(batch, 2, 2, 2, 2, height, width).mean((2, 4)).reshape(batch, 4, height, width)
-
-    right = by_four((error.detach() < 1.5).float())
-    sure = F.binary_cross_entropy_with_logits(head[:, LOGITS + GAINS :], right, reduction="none")
-    return main + 0.2 * (sure * by_four(weight)).sum() / total, (before * weight).sum() / total
+    right = F.avg_pool2d((error.detach() < 1.5).float()[:, None], 2)
+    sure = F.binary_cross_entropy_with_logits(F.pixel_shuffle(head[:, LOGITS + GAINS :], 2), right, reduction="none")
+    by_two = F.avg_pool2d(weight[:, None], 2)
+    return main + 0.2 * 4 * (sure * by_two).sum() / total, (before * weight).sum() / total
 
 
 def _begun(module: Module) -> None:
@@ -250,7 +257,7 @@ def _begun(module: Module) -> None:
     with torch.no_grad():
         bias = module.weights["head-bias"]
         bias[:LOGITS] = -3
-        bias[LOGITS : LOGITS + GAINS] = 0.15
+        bias[LOGITS : LOGITS + GAINS] = 0.1
 
 
 def _batches(folder: Path, batch: int, size: tuple[int, int], rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
@@ -269,11 +276,18 @@ def _batches(folder: Path, batch: int, size: tuple[int, int], rng: np.random.Gen
                 continue
             y, x = (int(rng.integers(0, record.shape[k] - size[k] + 1)) for k in (0, 1))
             crops.append(np.array(record[y : y + size[0], x : x + size[1]]))
-        yield {name: torch.from_numpy(a).permute(0, 3, 1, 2) for name, a in unpacked(np.stack(crops)).items()}
+        fields = unpacked(np.stack(crops))
+        fields["means"] = gains_around(fields["input"])
+        yield {name: torch.from_numpy(a).permute(0, 3, 1, 2).contiguous() for name, a in fields.items()}
 
 
 def _input_of(fields: dict[str, Tensor]) -> Tensor:
-    return (fields["input"].float() / _INPUT_STEPS).contiguous(memory_format=torch.channels_last)
+    return (fields["input"].float() / STEPS).contiguous(memory_format=torch.channels_last)
+
+
+def _by_steps(arrays: Mapping[str, NDArray[np.float32]], factor: float) -> dict[str, NDArray[np.float32]]:
+    """Return weights whose first layer takes other units: files are for bytes, training is for units."""
+    return {**arrays, "stem.weight": arrays["stem.weight"] * np.float32(factor)}
 
 
 def fit(
@@ -293,7 +307,7 @@ def fit(
     rate : float
         Learning rate after the first 200 steps; down a cosine.
     start : Path or None
-        Checkpoint whose averaged weights to begin with.
+        Weight file to begin with.
     size : tuple of int
         Crops in blocks of 4x4 pixels, multiples of 8.
     notes : dict or None
@@ -308,7 +322,7 @@ def fit(
     optimizer = torch.optim.AdamW(module.parameters(), lr=rate, weight_decay=1e-4, betas=(0.9, 0.99))
     checkpoint, done = output.with_suffix(".pt"), 0
     if start is not None:
-        module.load_state_dict(torch.load(start)["average"])
+        module.load(_by_steps(read(start).arrays, STEPS))
     average = {name: value.clone() for name, value in module.state_dict().items()}
     if checkpoint.is_file():
         held = torch.load(checkpoint)
@@ -325,7 +339,7 @@ def fit(
             group["lr"] = float(rate * min(1, (done + 1) / 200) * (0.02 + 0.98 * cosine))
         fields = next(batches)
         given = _input_of(fields)
-        apart = torch.where(given[:, _SCALE_CHANNEL, 0, 0] > 0.5, 2.0, 1.0)
+        apart = torch.where(given[:, _FIRST["scale"], 0, 0] > 0.5, 2.0, 1.0)
         with torch.autocast("cpu", torch.bfloat16):
             head = module({"evidence": given})["map"]
         value, before = compiled(head.float().contiguous(), fields, apart)
@@ -349,7 +363,11 @@ def fit(
     module.load_state_dict(average)
     ranges = calibrate(module, ({"evidence": _input_of(next(batches))} for _ in range(16)))
     content = WeightFile(
-        "evidence", "residual", module.arrays(), ranges, {**(notes or {}), "steps": done, "seed": seed}
+        "evidence",
+        "residual",
+        _by_steps(module.arrays(), 1 / STEPS),
+        ranges,
+        {**(notes or {}), "steps": done, "seed": seed},
     )
     write(output, content)
     return content

@@ -1,0 +1,85 @@
+"""Vector values for numba: 64 lanes of one integer or float type, written once for every processor.
+
+A `Vector` is a numba type whose value is one LLVM vector, ``<64 x i8>`` and so on. LLVM splits or widens it to
+what the processor has (two registers of AVX2, four of NEON or SSE), so there is one source and the same result
+everywhere: the integer operations are exact and the float ones are single IEEE operations, never contracted.
+
+The functions of this package can be called from compiled code only. They take flat arrays and offsets in
+elements. Nothing checks bounds but a build with ``STEREOKIT_CHECKED=1``, whose accesses outside of an array end the
+process.
+
+Layout of a row of costs or path costs (one row of the image, `W` pixels, `D` disparity levels padded to
+``P = 64 * ceil(D / 64)``)::
+
+    offset  0 .. P-1        P .. 2P-1       ...    (W-1)P .. WP-1
+            pixel x = 0     pixel x = 1            pixel x = W-1
+            d = 0 1 2 ...   d = 0 1 2 ...
+"""
+
+from __future__ import annotations
+
+from stereokit.kernels.simd.arithmetic import (
+    add,
+    add_saturated,
+    bits_of,
+    bitwise_or,
+    convert,
+    count_bits,
+    count_ones,
+    first_bit,
+    lowest,
+    mark_less,
+    mask_equal,
+    maximum,
+    minimum,
+    multiply,
+    multiply_high,
+    multiply_pairs,
+    select,
+    shift_left,
+    shift_right,
+    subtract,
+    xor,
+)
+from stereokit.kernels.simd.memory import aligned, load, prefetch, splat, splat_at, store, stream, stream_fence
+from stereokit.kernels.simd.shuffle import first_lane, lowest_of_4, shift_down, shift_up
+from stereokit.kernels.simd.types import LANES, Vector, vector_bits
+
+__all__ = [
+    "LANES",
+    "Vector",
+    "add",
+    "add_saturated",
+    "aligned",
+    "bits_of",
+    "bitwise_or",
+    "convert",
+    "count_bits",
+    "count_ones",
+    "first_bit",
+    "first_lane",
+    "load",
+    "lowest",
+    "lowest_of_4",
+    "mark_less",
+    "mask_equal",
+    "maximum",
+    "minimum",
+    "multiply",
+    "multiply_high",
+    "multiply_pairs",
+    "prefetch",
+    "select",
+    "shift_down",
+    "shift_left",
+    "shift_right",
+    "shift_up",
+    "splat",
+    "splat_at",
+    "store",
+    "stream",
+    "stream_fence",
+    "subtract",
+    "vector_bits",
+    "xor",
+]

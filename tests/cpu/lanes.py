@@ -1,0 +1,193 @@
+"""`stereokit.kernels.simd` in numpy, for kernels that Python runs: same names, same results, and checked accesses.
+
+A vector is a `Lanes`. A load or store outside of its array raises `OutOfBounds`; an array of `aligned` is full of
+garbage, so that values that nobody wrote spoil the result.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Lanes", "Misaligned", "OutOfBounds"]
+
+LANES = 64
+
+
+class OutOfBounds(Exception):
+    """An access outside of its array."""
+
+
+class Misaligned(Exception):
+    """A streamed vector that does not begin at a multiple of 64 bytes."""
+
+
+class Lanes:
+    """64 values of one type."""
+
+    __slots__ = ("values",)
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    @property
+    def scalar(self) -> Any:
+        """The type of a lane in numba."""
+        from numba import from_dtype
+
+        return from_dtype(self.values.dtype)
+
+
+def _part(array: np.ndarray, offset: Any, count: int = LANES) -> np.ndarray:
+    if array.ndim != 1 or not 0 <= offset <= array.size - count:
+        raise OutOfBounds(f"elements {offset} to {offset + count} of {array.size}")
+    return array[offset : offset + count]
+
+
+def load(array: np.ndarray, offset: Any) -> Lanes:
+    return Lanes(_part(array, offset).copy())
+
+
+def store(array: np.ndarray, offset: Any, value: Lanes) -> None:
+    if array.dtype != value.values.dtype:
+        raise TypeError(f"{value.values.dtype} into {array.dtype}")
+    _part(array, offset)[:] = value.values
+
+
+def stream(array: np.ndarray, offset: Any, value: Lanes) -> None:
+    if _part(array, offset).ctypes.data % 64:
+        raise Misaligned(f"element {offset}")
+    store(array, offset, value)
+
+
+def prefetch(array: np.ndarray, offset: Any) -> None:
+    pass
+
+
+def stream_fence() -> None:
+    pass
+
+
+def splat(scalar: Any) -> Lanes:
+    return Lanes(np.full(LANES, scalar, np.asarray(scalar).dtype))
+
+
+def splat_at(array: np.ndarray, offset: Any) -> Lanes:
+    return splat(_part(array, offset, 1)[0])
+
+
+def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    raw = np.random.default_rng(size).integers(0, 256, size + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    array = raw[start : start + size].view(dtype).reshape(shape)
+    if array.dtype.kind == "f":
+        array[:] = np.nan
+    return array
+
+
+def add(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(a.values + b.values)
+
+
+def subtract(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(a.values - b.values)
+
+
+def multiply(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(a.values * b.values)
+
+
+def multiply_high(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes((a.values.astype(np.int32) * b.values >> 16).astype(np.int16))
+
+
+def add_saturated(a: Lanes, b: Lanes) -> Lanes:
+    info = np.iinfo(a.values.dtype)
+    return Lanes(np.clip(a.values.astype(np.int64) + b.values, info.min, info.max).astype(a.values.dtype))
+
+
+def minimum(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(np.where(a.values < b.values, a.values, b.values))
+
+
+def maximum(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(np.where(a.values > b.values, a.values, b.values))
+
+
+def xor(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(a.values ^ b.values)
+
+
+def bitwise_or(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(a.values | b.values)
+
+
+def mark_less(a: Lanes, b: Lanes, bit: Any) -> Lanes:
+    return Lanes(np.where(a.values < b.values, np.uint8(bit), np.uint8(0)))
+
+
+def count_bits(value: Lanes) -> Lanes:
+    size = value.values.dtype.itemsize
+    bits = np.unpackbits(value.values.view(np.uint8).reshape(LANES, size), axis=1)
+    return Lanes(bits.sum(axis=1).astype(value.values.dtype))
+
+
+def count_ones(value: Any) -> Any:
+    return np.int32(bin(int(value)).count("1"))
+
+
+def convert(value: Lanes, like: Any) -> Lanes:
+    return Lanes(value.values.astype(np.asarray(like).dtype))
+
+
+def bits_of(value: Lanes) -> Lanes:
+    return Lanes(value.values.view(np.int32))
+
+
+def multiply_pairs(a: Lanes, b: Lanes) -> Lanes:
+    low = [v.values << 16 >> 16 for v in (a, b)]
+    high = [v.values >> 16 for v in (a, b)]
+    return Lanes(low[0] * low[1] + high[0] * high[1])
+
+
+def shift_left(value: Lanes, count: Any) -> Lanes:
+    return Lanes(value.values << value.values.dtype.type(count))
+
+
+def shift_right(value: Lanes, count: Any) -> Lanes:
+    return Lanes(value.values >> value.values.dtype.type(count))
+
+
+def shift_up(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(np.append(a.values[-1:], b.values[:-1]))
+
+
+def shift_down(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(np.append(a.values[1:], b.values[:1]))
+
+
+def lowest(value: Lanes) -> Any:
+    return value.values.min()
+
+
+def lowest_of_4(a: Lanes, b: Lanes, c: Lanes, d: Lanes) -> tuple[Lanes, ...]:
+    return tuple(splat(v.values.min()) for v in (a, b, c, d))
+
+
+def first_lane(value: Lanes) -> Any:
+    return value.values[0]
+
+
+def mask_equal(a: Lanes, b: Lanes) -> int:
+    return sum(1 << k for k in np.flatnonzero(a.values == b.values).tolist())
+
+
+def first_bit(mask: int) -> int:
+    mask = int(mask)
+    return (mask & -mask).bit_length() - 1 if mask else LANES
+
+
+def select(condition: Any, a: Any, b: Any) -> Any:
+    return a if condition else b

@@ -38,7 +38,7 @@ KITTI = ROOT / "refiners" / "kitti"
 CARDS = [CARD, KITTI / "stereokit_kitti_weights" / "MODEL_CARD.md", KITTI / "README.md"]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *CARDS, *sorted((ROOT / "docs").glob("*.md"))]
 RUN = ("export", "info", "list", "match", "view")
-EXTRAS = {"export": ("onnx", "onnxruntime"), "--refiner": ("openvino",), "view": ("jinja2",)}
+EXTRAS = {"export": ("onnxruntime",), "--refiner": ("openvino",), "view": ("jinja2",)}
 SHELL, OTHER = ("", "shell"), ("text", "toml")
 FENCE = re.compile(r"(?:^<!-- not run: (?P<reason>.+) -->\n)?^```(?P<language>.*)\n(?P<code>(?s:.*?))^```$", re.M)
 
@@ -246,7 +246,7 @@ def public_modules() -> set[str]:
 
 INTERNAL = re.compile(
     r"stereokit\.(kernels|cuda|images|methods|io\.|cli\.(?!app))"
-    r"|stereokit_refiners\.runtimes\.(openvino|onnx|torch|reference|evidence|mixture)"
+    r"|stereokit_refiners\.runtimes\.(openvino|onnx|onnx_file|opencv|torch|reference|evidence|mixture)"
     r"|stereokit_evaluation\.(common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes|generated))"
     r"|.*_cuda$"
 )

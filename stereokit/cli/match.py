@@ -14,6 +14,7 @@ from stereokit.cli.options import (
     DeviceOption,
     FillOption,
     JsonOption,
+    LayoutOption,
     MaxDisparityOption,
     MethodOption,
     MinDisparityOption,
@@ -51,11 +52,14 @@ __all__ = ["match"]
 
 def match(
     left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a rectified pair.")],
-    right_image: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="FILE", help=".png (KITTI, x256), .pfm, .npy or .tiff."),
     ],
+    right_image: Annotated[
+        Path | None, typer.Argument(metavar="[RIGHT]", help="Right image, of the same size; none if LEFT holds both.")
+    ] = None,
+    layout: LayoutOption = None,
     method: MethodOption = "census+sgm",
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
@@ -129,6 +133,8 @@ def match(
     outputs.update(check_json(json_file))
     inputs = {"--calibration": calibration, "--mask": mask, "--right-mask": right_mask}
     _check_distinct({"LEFT": left, "RIGHT": right_image, **inputs}, outputs)
+    if layout is not None and right_image is not None:
+        raise OptionError("--layout is for one file with both views, got LEFT and RIGHT")
     if rig is not None and calibration is not None:
         raise OptionError("--rig and --calibration exclude each other: rectification gives the calibration")
     if rig is None and (ply is None and depth is None) != (calibration is None):
@@ -161,6 +167,8 @@ def match(
             raise OptionError("--rig is not available with --memory and --overlap; stereokit rectify comes before them")
         if align:
             raise OptionError("--align is not available with --memory and --overlap")
+        if right_image is None:
+            raise OptionError("RIGHT must be given with --memory and --overlap: one file with both views is read whole")
         from stereokit.cli.match_large import match_in_windows
 
         mask_files = {"mask": mask, "right_mask": right_mask}
@@ -174,7 +182,7 @@ def match(
     from stereokit.matching import Matcher
 
     matcher = Matcher(method, **matcher_options, **options)
-    images = io.read_pair(left, right_image, alpha=True)
+    images = io.read_views(left, layout) if right_image is None else io.read_pair(left, right_image, alpha=True)
     height, width = images[0].shape[:2]
     if images[1].shape[:2] != (height, width):
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
@@ -215,7 +223,7 @@ def match(
         result.save_depth(depth, camera, filled=filled, max_depth=max_depth)
     content = {
         "left": str(left),
-        "right": str(right_image),
+        "right": None if right_image is None else str(right_image),
         "outputs": {name.removeprefix("--"): str(path) for name, path in outputs.items() if name != "--json"},
         "width": width,
         "height": height,

@@ -368,6 +368,8 @@ def _brightness(pair: GrayPair, places: tuple[NDArray[np.float64], NDArray[np.fl
 
 def _sharpness(image: NDArray[np.uint8]) -> float:
     """Return how much of an image's slopes is of the finest scale: the energy of its Laplacian over its gradient's."""
+    if min(image.shape) < 3:
+        return 1.0
     soft = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
     slopes = float(np.square(np.diff(soft, axis=0)).mean() + np.square(np.diff(soft, axis=1)).mean())
     return float(np.square(cv2.Laplacian(soft, cv2.CV_32F)).mean()) / max(slopes, 1e-6) + 1e-6

@@ -14,10 +14,8 @@ from stereokit_refiners.weights import NETWORKS, WeightFile, find, write
 
 NAN = np.nan
 NAMES = tuple(name for name, network in NETWORKS.items() if "disparity" in network.inputs)
-LEARNED = [name for name in ("openvino", "onnxruntime", "torch") if importlib.util.find_spec(name)]
-needs_backend = pytest.mark.skipif(
-    not LEARNED or not importlib.util.find_spec("safetensors"), reason="needs a runtime for networks, and safetensors"
-)
+LEARNED = [*(name for name in ("openvino", "onnxruntime", "torch") if importlib.util.find_spec(name)), "opencv"]
+"""Runtimes of networks that are installed."""
 
 
 def random_arrays(name, seed=0, last=0.05):

@@ -6,14 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from refining import LEARNED, NAMES, coarse_of, half_of, image_of, needs_backend, random_content
+from refining import LEARNED, NAMES, coarse_of, half_of, image_of, random_content
 
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.networks.pyramid import OFFSETS
 from stereokit_refiners.weights import NETWORKS
-
-pytestmark = needs_backend
 
 SIZES = [(16, 32), (33, 47), (1, 1), (1, 9), (9, 1), (18, 31)]
 CHOICES = [(0, 0, 0, 0), (1, 1, 1, 1), (0, 1, 1, 0), (1, 0, 0, 0)]
@@ -70,7 +68,6 @@ def test_tensors_copy_the_same_candidate(choice, size):
 @pytest.mark.parametrize("choice", CHOICES)
 def test_exported_graphs_copy_the_same_candidate(choice):
     onnxruntime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
     from stereokit_refiners.commands.export import onnx_model
 
     size = (16, 32)

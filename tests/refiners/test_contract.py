@@ -17,7 +17,6 @@ from refining import (
     flat_ranges,
     half_of,
     image_of,
-    needs_backend,
     one_line,
     random_content,
     sure,
@@ -30,8 +29,6 @@ from stereokit import Disparity
 from stereokit.errors import OptionError, StereokitError
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import NETWORKS
-
-pytestmark = needs_backend
 
 SIZES = [(32, 48), (33, 47), (1, 1), (1, 9), (9, 1), (2, 3), (18, 30), (31, 16)]
 
@@ -275,10 +272,11 @@ def test_backends_are_checked(tmp_path):
         LearnedRefiner(path, precision="fp16")
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch", "opencv"])
 @pytest.mark.parametrize("precision", ["bf16", "int8"])
 def test_low_precision_needs_openvino(backend, precision):
-    pytest.importorskip(backend)
+    if backend not in LEARNED:
+        pytest.skip(f"needs {backend}")
     with pytest.raises(OptionError, match=rf"^precision must be fp32 with backend '{backend}', got '{precision}'$"):
         LearnedRefiner.of(random_content("cnn"), backend=backend, precision=precision)
     assert LearnedRefiner.of(random_content("cnn"), backend=backend).precision == "fp32"
@@ -316,17 +314,13 @@ def test_a_runtime_that_is_not_there_is_named(monkeypatch):
     for backend, extra in {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}.items():
         with pytest.raises(StereokitError, match=rf"^backend '{backend}' is not installed: .*stereokit\[{extra}\]'$"):
             LearnedRefiner.of(random_content("cnn"), backend=backend)
-    rule = r"need OpenVINO, ONNX Runtime or torch: pip install 'stereokit\[refiners\]', or 'stereokit\[onnx\]' where "
-    with pytest.raises(StereokitError, match=rule):
+    assert LearnedRefiner.of(random_content("cnn")).backend == "opencv"
+    monkeypatch.delattr("cv2.dnn")
+    with pytest.raises(
+        StereokitError, match=r"^backend 'opencv' is not installed: pip install opencv-python-headless$"
+    ):
+        LearnedRefiner.of(random_content("cnn"), backend="opencv")
+    with pytest.raises(
+        StereokitError, match=r"^learned refiners need OpenCV's dnn, which this build lacks, or another "
+    ):
         LearnedRefiner.of(random_content("cnn"))
-
-
-def test_onnxruntime_without_onnx_is_not_chosen(monkeypatch):
-    import importlib.util
-
-    real = importlib.util.find_spec
-    hidden = {"openvino", "onnx"}
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n in hidden else real(n, *a))
-    if real("torch") is None:
-        pytest.skip("needs torch beside ONNX Runtime")
-    assert LearnedRefiner.of(random_content("cnn")).backend == "torch"

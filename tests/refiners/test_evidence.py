@@ -284,7 +284,7 @@ def _refiner(backend="auto"):
     return EvidenceRefiner.of(_weights(), backend=backend, precision="fp32")
 
 
-@pytest.mark.parametrize("backend", ["openvino", "onnxruntime"])
+@pytest.mark.parametrize("backend", ["openvino", "onnxruntime", "opencv"])
 def test_runtimes_agree_with_torch(backend):
     disparity, candidates, confidence, left, right = _case(2, seed=8, rows=61, columns=75)
     coarse = stereokit.Disparity(disparity, np.ones(disparity.shape, bool), confidence, candidates=candidates)

@@ -243,7 +243,7 @@ def test_an_interrupted_openvino_export_leaves_no_half(tmp_path, monkeypatch):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("missing", ["onnx", "onnxruntime", "openvino"])
+@pytest.mark.parametrize("missing", ["onnxruntime", "openvino"])
 def test_packages_that_are_missing_are_named(missing, tmp_path, monkeypatch):
     import importlib.util
 

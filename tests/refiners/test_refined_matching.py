@@ -7,15 +7,13 @@ import pickle
 import cv2
 import numpy as np
 import pytest
-from refining import LEARNED, NAMES, needs_backend, one_line, random_content, tuned_to_kitti, weight_file
+from refining import LEARNED, NAMES, one_line, random_content, tuned_to_kitti, weight_file
 from typer.testing import CliRunner
 
 import stereokit
 from stereokit.cli.app import app
 from stereokit.errors import OptionError, StereokitError
 from stereokit_refiners.learned import LearnedRefiner
-
-pytestmark = needs_backend
 
 METHOD = {"method": "census+sgm", "max_disparity": 24, "scale": 0.5}
 

@@ -12,7 +12,6 @@ from refining import (
     coarse_of,
     encoded_of,
     image_of,
-    needs_backend,
     random_arrays,
     random_content,
     tuned_to_kitti,
@@ -23,8 +22,6 @@ from stereokit_refiners import learned
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.runtimes import reference
 from stereokit_refiners.weights import NETWORKS
-
-pytestmark = needs_backend
 
 SIZE = (32, 48)
 

@@ -8,7 +8,7 @@ import warnings
 import cv2
 import numpy as np
 import pytest
-from refining import NAMES, coarse_of, image_of, needs_backend, random_content, sure, tuned_to_kitti
+from refining import NAMES, coarse_of, image_of, random_content, sure, tuned_to_kitti
 
 import stereokit
 from stereokit import Matcher
@@ -16,8 +16,6 @@ from stereokit.errors import StereokitWarning
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.runtimes.encode import BEGINNING, base_of
-
-pytestmark = needs_backend
 
 HEIGHT, WIDTH = 128, 512
 OFFSETS = (0, 60, 120, 200)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from stereokit.calibration import Calibration
 from stereokit.errors import FileError, InputError, OptionError, StereokitError
 from stereokit.io import parsing
-from stereokit_evaluation.batch.video import FramePair
+from stereokit_evaluation.batch.video import FramePair, Frames
 
 __all__ = ["BAG_SUFFIXES", "Bag", "is_bag", "write_bag"]
 
@@ -63,7 +63,7 @@ def _reader(path: Path) -> Any:
         return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
 
-class Bag:
+class Bag(Frames):
     """The pairs of a bag.
 
     Parameters
@@ -94,7 +94,7 @@ class Bag:
         images = sorted(topic for topic, kind in kinds.items() if kind in (_IMAGE, _COMPRESSED))
         self.topics = _chosen(path, images, topics)
         self._infos = [_info_topic(topic, kinds) for topic in self.topics]
-        self.expected: int | None = min(counts[topic] for topic in self.topics)
+        self.expected = min(counts[topic] for topic in self.topics)
 
     def frames(self, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[FramePair]:
         """Yield the pairs whose names are wanted, in the order of their stamps as they were recorded."""

@@ -10,16 +10,19 @@ import errno
 import threading
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.cli.pair import read_mask
 from stereokit.errors import InputError, StereokitError, one_line
 from stereokit.io import read_pair, write_disparity, write_image
 from stereokit.matching import Matcher
 from stereokit.notices import collecting
+from stereokit.pairs import align_rows
 from stereokit.result import colorize
 from stereokit.rig import Rectification, read_rig
 from stereokit_evaluation.batch.store import COLOR, make_below, publish, target_of
@@ -48,6 +51,12 @@ class Job:
         Files of raw cameras, absolute, with which the images are rectified first; empty for rectified pairs.
     alpha : float or None
         Of `stereokit.StereoRig.rectification`.
+    mask, right_mask : str or None
+        Files with the usable pixels of all left, and of all right images.
+    align : bool
+        Align the rows of each pair first.
+    strict : bool
+        Pairs that would be warned of fail.
     """
 
     folder: str
@@ -57,6 +66,10 @@ class Job:
     options: tuple[tuple[str, Any], ...]
     rig: tuple[str, ...] = ()
     alpha: float | None = None
+    mask: str | None = None
+    right_mask: str | None = None
+    align: bool = False
+    strict: bool = False
 
 
 @dataclass(frozen=True)
@@ -107,17 +120,23 @@ def work(job: Job, name: str, left: str | NDArray[Any], right: str | NDArray[Any
             return Outcome(name)
         with collecting() as warnings:
             if isinstance(left, str) and isinstance(right, str):
-                left, right = read_pair(left, right)
+                left, right = read_pair(left, right, alpha=True)
             images = np.asarray(left), np.asarray(right)
             if images[0].shape[:2] != images[1].shape[:2]:
                 sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
                 raise InputError(f"left and right must have the same size, got {sizes}")
             matcher = matcher_of(job)
-            masks = {}
+            masks: dict[str, NDArray[np.bool_]] = {}
             if job.rig:
                 rectification = rectification_of(job, (images[0].shape[1], images[0].shape[0]))
                 images, masks = rectification(*images), rectification.masks
+            for mask_name, drawn in _masks(job, images[0].shape[:2]).items():
+                masks[mask_name] = masks[mask_name] & drawn if mask_name in masks else drawn
+            if job.align:
+                images = images[0], align_rows(*images, nodata=matcher.settings.nodata)[0]
             result = matcher(*images, **masks)
+        if job.strict and warnings:
+            raise InputError(f"{warnings[0]} (--strict)")
         if job.color:  # before the map, whose existence means that the pair is complete
             picture = folder / COLOR / f"{name}.png"
             make_below(folder, *picture.parent.relative_to(folder).parts)
@@ -138,6 +157,19 @@ def describe(error: BaseException) -> str:
     """Return an error in one line, with its type unless it is one of ours."""
     text = one_line(str(error))
     return text if isinstance(error, StereokitError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
+
+
+def _masks(job: Job, shape: tuple[int, ...]) -> dict[str, NDArray[np.bool_]]:
+    size = int(shape[0]), int(shape[1])
+    masks = {
+        name: _mask(name, path, size) for name, path in (("mask", job.mask), ("right_mask", job.right_mask)) if path
+    }
+    return {name: mask for name, mask in masks.items() if mask is not None}
+
+
+@lru_cache(maxsize=4)
+def _mask(name: str, path: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    return read_mask(f"--{name.replace('_', '-')}", Path(path), size)
 
 
 _matchers: dict[Job, Matcher] = {}

@@ -23,7 +23,7 @@ from stereokit.notices import collecting
 from stereokit_evaluation.batch.job import Job, Outcome, matcher_of, work
 from stereokit_evaluation.batch.pairs import PairFiles
 from stereokit_evaluation.batch.store import finished, folder_identity, open_output
-from stereokit_evaluation.batch.video import FramePair, Video
+from stereokit_evaluation.batch.video import FramePair, Frames
 from stereokit_evaluation.common.environment import versions
 
 __all__ = ["Engine", "Summary", "identity", "on_threads", "run_batch"]
@@ -109,9 +109,11 @@ class Summary:
 def identity(job: Job, inputs: Any) -> dict[str, Any]:
     """Return everything that all maps of a job depend on: resolved options, weights, version and inputs."""
     matcher = matcher_of(job)
+    evidence = {"mask": job.mask, "right_mask": job.right_mask, "align": job.align or None}
     return {
         "inputs": inputs,
         **matcher.identity(),
+        **{name: value for name, value in evidence.items() if value is not None},
         "format": job.suffix,
         "color": job.color,
         **({"rig": digest(job.rig), "alpha": job.alpha} if job.rig else {}),
@@ -121,7 +123,7 @@ def identity(job: Job, inputs: Any) -> dict[str, Any]:
 
 def run_batch(
     job: Job,
-    source: list[PairFiles] | Video,
+    source: list[PairFiles] | Frames,
     engine: Engine,
     *,
     inputs: Any,
@@ -133,7 +135,7 @@ def run_batch(
     Parameters
     ----------
     job : Job
-    source : list of PairFiles or Video
+    source : list of PairFiles, or Frames
     engine : callable
         `on_threads` or `stereokit_evaluation.batch.dask.on_cluster` with their options.
     inputs : str, or a list of them
@@ -157,9 +159,7 @@ def run_batch(
         If the folder has maps of other options.
     """
     summary = Summary()
-    is_own: Callable[[str], bool] = str.isdigit
-    if not isinstance(source, Video):
-        is_own = {pair.name for pair in source}.__contains__
+    is_own = source.owns if isinstance(source, Frames) else {pair.name for pair in source}.__contains__
     folder = Path(job.folder)
     with open_output(folder, identity(job, inputs), job.suffix, is_own, overwrite) as existing:
         folder_id = folder_identity(folder)
@@ -233,8 +233,8 @@ def _outcome(job: Job, pair: PairFiles | FramePair) -> Outcome:
     return work(job, pair.name, pair.left, pair.right)
 
 
-def _pending(source: list[PairFiles] | Video, existing: set[str]) -> Iterator[PairFiles | FramePair]:
-    if isinstance(source, Video):
+def _pending(source: list[PairFiles] | Frames, existing: set[str]) -> Iterator[PairFiles | FramePair]:
+    if isinstance(source, Frames):
         yield from source.frames(lambda name: name not in existing)
     else:
         yield from (pair for pair in source if pair.name not in existing)

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import FileError, InputError
-from stereokit.io import parsing
+from stereokit.errors import FileError, InputError, OptionError
+from stereokit.io import parsing, split_views
 from stereokit.io.quiet import quiet_decoders
 
-__all__ = ["FramePair", "Video"]
+__all__ = ["FramePair", "Frames", "Video"]
 
 Image = NDArray[np.uint8]
 
@@ -33,7 +33,27 @@ class FramePair:
     reason: str = ""
 
 
-class Video:
+class Frames:
+    """A source of pairs that come as images, one after the other.
+
+    Attributes
+    ----------
+    expected : int or None
+        How many there are, as far as the source tells; it may be wrong.
+    """
+
+    expected: int | None = None
+
+    def frames(self, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[FramePair]:
+        """Yield the frames whose names are wanted."""
+        raise NotImplementedError
+
+    def owns(self, name: str) -> bool:
+        """Return whether a frame of the source may have this name: here, a number."""
+        return name.isdigit()
+
+
+class Video(Frames):
     """A stereo video.
 
     Parameters
@@ -42,6 +62,8 @@ class Video:
         The left camera's video, or both side by side.
     right : Path or None
         The right camera's video.
+    layout : str
+        Where the views are in the one video; see `stereokit.io.LAYOUTS`.
 
     Raises
     ------
@@ -51,7 +73,7 @@ class Video:
         If the two differ in size, or the one cannot be halved.
     """
 
-    def __init__(self, left: Path, right: Path | None = None) -> None:
+    def __init__(self, left: Path, right: Path | None = None, layout: str = "side-by-side") -> None:
         self.paths = [left] if right is None else [left, right]
         captures = [_open(path) for path in self.paths]
         try:
@@ -63,8 +85,12 @@ class Video:
         if len(set(sizes)) > 1:
             texts = " and ".join(f"{width}x{height}" for width, height in sizes)
             raise InputError(f"the two videos must have the same size, got {texts}")
-        if right is None and sizes[0][0] % 2:
-            raise InputError(f"a video with both views side by side must have an even width, got {sizes[0][0]}")
+        self.layout = layout
+        if right is None:
+            try:
+                split_views(np.empty(sizes[0][::-1], np.bool_), layout)
+            except OptionError as error:
+                raise InputError(f"the video: {error}") from None
         self.expected: int | None = (
             min(counts) if min(counts) > 0 else None
         )  # by the files' headers, which may be wrong
@@ -84,7 +110,7 @@ class Video:
                         yield FramePair(name, None, None, f"the {side} video ends before the other")
                     return
                 if wanted(name):
-                    yield _frame(name, captures)
+                    yield _frame(name, captures, self.layout)
                 number += 1
         finally:
             for capture in captures:
@@ -104,7 +130,7 @@ def _open(path: Path) -> Any:
     return capture
 
 
-def _frame(name: str, captures: list[Any]) -> FramePair:
+def _frame(name: str, captures: list[Any], layout: str) -> FramePair:
     images = []
     for capture in captures:
         with quiet_decoders():
@@ -113,6 +139,5 @@ def _frame(name: str, captures: list[Any]) -> FramePair:
             return FramePair(name, None, None, "the frame cannot be decoded")
         images.append(np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image))
     if len(images) == 1:
-        half = images[0].shape[1] // 2
-        images = [np.ascontiguousarray(images[0][:, :half]), np.ascontiguousarray(images[0][:, half:])]
+        images = list(split_views(images[0], layout))
     return FramePair(name, images[0], images[1])

@@ -23,7 +23,7 @@ from stereokit.rig.boards import Board, parse_length
 from stereokit.rig.calibrate import BoardCalibration, PairQuality, rectification_of, rows_picture
 from stereokit.rig.calibrate import calibrate as calibrate_pairs
 from stereokit_evaluation.batch.pairs import PairFiles
-from stereokit_evaluation.batch.video import Video
+from stereokit_evaluation.batch.video import Frames
 from stereokit_evaluation.commands.batch import find_pairs
 from stereokit_evaluation.commands.rectify import images_of
 from stereokit_evaluation.common.progress import progress
@@ -64,7 +64,7 @@ def calibrate(
     check_integer("every", every, 1)
     plate = _board(board, square, marker, dictionary)
     source = find_pairs(inputs, pattern)[0]
-    total = source.expected if isinstance(source, Video) else len(source)
+    total = source.expected if isinstance(source, Frames) else len(source)
     unread: list[PairQuality] = []
     with progress(None if total is None else -(-total // every)) as (_, step):
         calibration = calibrate_pairs(
@@ -87,12 +87,12 @@ def _board(text: str, square: str, marker: str | None, dictionary: str) -> Board
 
 
 def _pairs(
-    source: list[PairFiles] | Video, every: int, unread: list[PairQuality], step: Any
+    source: list[PairFiles] | Frames, every: int, unread: list[PairQuality], step: Any
 ) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
     """Yield each so-many-th pair that can be read; the others are told."""
-    chosen: list[PairFiles] | Video = source if isinstance(source, Video) else source[::every]
+    chosen: list[PairFiles] | Frames = source if isinstance(source, Frames) else source[::every]
     for number, (name, images, reason) in enumerate(images_of(chosen)):
-        if isinstance(source, Video) and number % every:
+        if isinstance(source, Frames) and number % every:
             continue
         if images is None:
             unread.append(PairQuality(name, reason))
@@ -101,11 +101,11 @@ def _pairs(
         step("", 1)
 
 
-def _draw(source: list[PairFiles] | Video, calibration: BoardCalibration, picture: Path) -> None:
+def _draw(source: list[PairFiles] | Frames, calibration: BoardCalibration, picture: Path) -> None:
     """Write the pair whose rows differ most, of those that were used."""
     used = [pair for pair in calibration.pairs if not pair.reason]
     worst = max(used, key=lambda pair: pair.epipolar_px or 0.0).name
-    if isinstance(source, Video):
+    if isinstance(source, Frames):
         frames = source.frames(lambda name: name == worst)
         images = next(((f.left, f.right) for f in frames if f.left is not None and f.right is not None), None)
     else:

@@ -19,7 +19,7 @@ from stereokit.io import IMAGE_SUFFIXES, READABLE_SUFFIXES, make_folder, read_pa
 from stereokit.rig import Rectification
 from stereokit.rig.calibrate import rows_picture
 from stereokit_evaluation.batch.pairs import PairFiles
-from stereokit_evaluation.batch.video import Video
+from stereokit_evaluation.batch.video import Frames
 from stereokit_evaluation.commands.batch import find_pairs
 from stereokit_evaluation.common.progress import progress
 
@@ -55,7 +55,7 @@ def rectify(
         raise OptionError(f"format must be one of {', '.join(_FORMATS)}, got {file_format!r}")
     options: dict[str, Any] = {"alpha": alpha, "size": parse_size("--size", size), "crop": crop, "focal": focal}
     source = raw_pairs(inputs, pattern)
-    total = source.expected if isinstance(source, Video) else len(source)
+    total = source.expected if isinstance(source, Frames) else len(source)
     rectification: Rectification | None = None
     failed: list[tuple[str, str]] = []
     count = 0
@@ -101,7 +101,7 @@ def rectify(
         raise typer.Exit(1)
 
 
-def raw_pairs(inputs: list[Path], pattern: tuple[str, str] | None = None) -> list[PairFiles] | Video:
+def raw_pairs(inputs: list[Path], pattern: tuple[str, str] | None = None) -> list[PairFiles] | Frames:
     """Return the pairs of the inputs: two images, or what `stereokit batch` takes.
 
     Raises
@@ -117,10 +117,10 @@ def raw_pairs(inputs: list[Path], pattern: tuple[str, str] | None = None) -> lis
 
 
 def images_of(
-    source: list[PairFiles] | Video,
+    source: list[PairFiles] | Frames,
 ) -> Iterator[tuple[str, tuple[NDArray[Any], NDArray[Any]] | None, str]]:
     """Yield name and images of each pair, None and the reason where there are none."""
-    for pair in source.frames() if isinstance(source, Video) else source:
+    for pair in source.frames() if isinstance(source, Frames) else source:
         left, right = pair.left, pair.right
         if left is None or right is None:
             yield pair.name, None, pair.reason

@@ -147,6 +147,27 @@ def test_rectify_two_images_with_options(scene, tmp_path):
     assert not (tmp_path / "no").exists()
 
 
+def test_a_rig_in_two_files_or_in_a_folder(scene, tmp_path):
+    folder, rig, images = scene
+    place = tmp_path / "rig"
+    place.mkdir()
+    for name, entries in (
+        (
+            "intrinsics.yml",
+            {"M1": rig.left.matrix, "D1": rig.left.distortion, "M2": rig.right.matrix, "D2": rig.right.distortion},
+        ),
+        ("extrinsics.yml", {"R": rig.rotation, "T": rig.translation_m}),
+    ):
+        file = cv2.FileStorage(str(place / name), cv2.FILE_STORAGE_WRITE)
+        for key, value in entries.items():
+            file.write(key, np.atleast_2d(value))
+        file.release()
+    raw = folder / "raw/left01.png", folder / "raw/right01.png"
+    for words in (place, f"{place / 'intrinsics.yml'},{place / 'extrinsics.yml'}"):
+        run("rectify", *raw, "-o", tmp_path / "out", "--rig", words)
+        np.testing.assert_array_equal(io.read_image(tmp_path / "out/left/left01.png"), rig.rectify(*images)[0])
+
+
 def test_rectify_names_pairs_that_fail(scene, tmp_path):
     folder, _, images = scene
     place = tmp_path / "raw"

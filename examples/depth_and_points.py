@@ -28,7 +28,7 @@ one_pixel = middle**2 / (camera.fx * camera.baseline_m)  # how far depth moves w
 print(f"depth: {near:.1f} m to {far:.1f} m, median {middle:.1f} m, where one pixel is {one_pixel:.2f} m")
 
 points_m = result.points(camera, max_depth=80, frame="y-up")  # what lies farther is mostly noise
-kept = np.isfinite(points_m).all(axis=2)
+usable = np.isfinite(points_m).all(axis=2)
 colors = left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2)
-stereokit.io.write_ply("points.ply", points_m[kept], colors[kept], "x right, y up, z backward; metres")
-print(f"points.ply: {np.count_nonzero(kept)} points")
+stereokit.io.write_ply("points.ply", points_m[usable], colors[usable], "x right, y up, z backward; metres")
+print(f"points.ply: {np.count_nonzero(usable)} points")

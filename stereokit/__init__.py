@@ -22,6 +22,7 @@ from stereokit.notices import PairWarning
 from stereokit.pairs import Fault, PairReport, align_rows, check_pair
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
+from stereokit.rig import StereoRig, read_rig
 from stereokit.selection import select
 from stereokit.stages import aggregate, cost_volume
 
@@ -43,6 +44,7 @@ __all__ = [
     "PairReport",
     "PairWarning",
     "RowCost",
+    "StereoRig",
     "StereokitError",
     "StereokitWarning",
     "UnknownNameError",
@@ -56,6 +58,7 @@ __all__ = [
     "match_large",
     "read_disparity",
     "read_image",
+    "read_rig",
     "select",
     "warmup",
     "write_disparity",

@@ -30,6 +30,8 @@ from stereokit.cli.info import info, list_
 from stereokit.cli.match import match
 from stereokit.cli.output import version_of
 from stereokit.cli.pair import check
+from stereokit.cli.rig import rig
+from stereokit.cli.warmup import warmup
 from stereokit.errors import StereokitError, one_line
 from stereokit.notices import collecting
 
@@ -139,6 +141,8 @@ app.command()(match)
 app.command()(check)
 app.command("list")(list_)
 app.command()(info)
+app.command()(warmup)
+app.command()(rig)
 
 
 def _plugin(entry: metadata.EntryPoint) -> Any:

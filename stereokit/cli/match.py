@@ -14,6 +14,7 @@ from stereokit.cli.options import (
     DeviceOption,
     FillOption,
     JsonOption,
+    LayoutOption,
     MaxDisparityOption,
     MethodOption,
     MinDisparityOption,
@@ -37,6 +38,7 @@ from stereokit.cli.pair import (
     read_mask,
     strictly,
 )
+from stereokit.cli.rig import AlphaOption, RigOption, read_rig_option
 from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
 from stereokit.notices import collecting
 
@@ -50,11 +52,14 @@ __all__ = ["match"]
 
 def match(
     left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a rectified pair.")],
-    right_image: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="FILE", help=".png (KITTI, x256), .pfm, .npy or .tiff."),
     ],
+    right_image: Annotated[
+        Path | None, typer.Argument(metavar="[RIGHT]", help="Right image, of the same size; none if LEFT holds both.")
+    ] = None,
+    layout: LayoutOption = None,
     method: MethodOption = "census+sgm",
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
@@ -71,12 +76,14 @@ def match(
         Path | None, typer.Option(metavar="FILE", help="Also the confidence: .npy, or .png (16-bit, x65535).")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Calibration of the rectified pair, for --ply and --depth.")
+        Path | None, typer.Option(metavar="FILE", help="Calibration of a rectified pair, for --ply and --depth.")
     ] = None,
     calibration_scale: Annotated[
         float, typer.Option(metavar="FACTOR", help="The images are so many times the size of the calibration's.")
     ] = 1.0,
     cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Also a point cloud, metres.")] = None,
     depth: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also the depth: .png (16-bit mm), .tiff or .npy (metres).")
@@ -103,6 +110,7 @@ def match(
 
     Everything is checked before matching starts. The first run on a machine also compiles, once. With --memory the
     images (.npy, .tiff or any other) are matched in windows, and the map goes to .npy or tiled .tiff as it grows.
+    With --rig the images are raw ones: they are rectified first, and the map is that of the rectified left view.
     """
     import numpy as np
 
@@ -125,8 +133,14 @@ def match(
     outputs.update(check_json(json_file))
     inputs = {"--calibration": calibration, "--mask": mask, "--right-mask": right_mask}
     _check_distinct({"LEFT": left, "RIGHT": right_image, **inputs}, outputs)
-    if (ply is None and depth is None) != (calibration is None):
+    if layout is not None and right_image is not None:
+        raise OptionError("--layout is for one file with both views, got LEFT and RIGHT")
+    if rig is not None and calibration is not None:
+        raise OptionError("--rig and --calibration exclude each other: rectification gives the calibration")
+    if rig is None and (ply is None and depth is None) != (calibration is None):
         raise OptionError("--ply and --depth go together with --calibration, got only one of them")
+    if alpha is not None and rig is None:
+        raise OptionError("--alpha is for --rig")
     _check_metres(frame, max_depth, calibration_scale)
     options = parse_settings(settings or [])
     flags = {
@@ -149,14 +163,18 @@ def match(
         for name in ("--color", "--right", "--confidence", "--ply", "--depth"):
             if name in outputs:
                 raise OptionError(f"{name} is not available with --memory and --overlap")
+        if rig is not None:
+            raise OptionError("--rig is not available with --memory and --overlap; stereokit rectify comes before them")
         if align:
             raise OptionError("--align is not available with --memory and --overlap")
+        if right_image is None:
+            raise OptionError("RIGHT must be given with --memory and --overlap: one file with both views is read whole")
         from stereokit.cli.match_large import match_in_windows
 
-        masks = {"mask": mask, "right_mask": right_mask}
+        mask_files = {"mask": mask, "right_mask": right_mask}
         with strictly(strict):
             content, table = match_in_windows(
-                left, right_image, output, method, memory, overlap, {**matcher_options, **options, **masks}
+                left, right_image, output, method, memory, overlap, {**matcher_options, **options, **mask_files}
             )
         report({**content, "options": options, "version": version_of("stereokit")}, [table], json_file)
         return
@@ -164,16 +182,21 @@ def match(
     from stereokit.matching import Matcher
 
     matcher = Matcher(method, **matcher_options, **options)
-    images = io.read_pair(left, right_image, alpha=True)
+    images = io.read_views(left, layout) if right_image is None else io.read_pair(left, right_image, alpha=True)
     height, width = images[0].shape[:2]
     if images[1].shape[:2] != (height, width):
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
         raise InputError(f"LEFT and RIGHT must have the same size, got {sizes}")
     camera = _read_camera(calibration, cameras, calibration_scale, width, height)
-    masks = {
-        "mask": read_mask("--mask", mask, (height, width)),
-        "right_mask": read_mask("--right-mask", right_mask, (height, width)),
-    }
+    masks: dict[str, NDArray[Any] | None] = {}
+    if rig is not None:
+        rectification = read_rig_option(rig, (width, height)).rectification(alpha=alpha)
+        images, camera = rectification(*images), rectification.calibration
+        masks.update(rectification.masks)
+        width, height = rectification.size
+    for name, file in {"mask": mask, "right_mask": right_mask}.items():
+        drawn, seen = read_mask(f"--{name.replace('_', '-')}", file, (height, width)), masks.get(name)
+        masks[name] = drawn if seen is None else seen if drawn is None else drawn & seen
     if align:
         images = images[0], aligned(*images, nodata)
 
@@ -200,12 +223,13 @@ def match(
         result.save_depth(depth, camera, filled=filled, max_depth=max_depth)
     content = {
         "left": str(left),
-        "right": str(right_image),
+        "right": None if right_image is None else str(right_image),
         "outputs": {name.removeprefix("--"): str(path) for name, path in outputs.items() if name != "--json"},
         "width": width,
         "height": height,
         **matcher_report(matcher),
         "options": options,
+        **({} if rig is None else {"rig": rig, "alpha": alpha}),
         "density": result.density,
         "seconds": seconds,
         "version": version_of("stereokit"),

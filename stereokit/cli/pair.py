@@ -53,7 +53,7 @@ def read_mask(name: str, path: Path | None, shape: tuple[int, int]) -> NDArray[A
     from stereokit import io
 
     mask = io.read_image(path)
-    usable = mask != 0 if mask.ndim == 2 else (mask != 0).any(axis=2)
+    usable: NDArray[Any] = mask != 0 if mask.ndim == 2 else (mask != 0).any(axis=2)
     if usable.shape != shape:
         sizes = f"{shape[1]}x{shape[0]}, got {usable.shape[1]}x{usable.shape[0]}"
         raise InputError(f"{name} must have the size of the images, {sizes} in {str(path)!r}")

@@ -86,19 +86,19 @@ def black_border(image: NDArray[Any]) -> NDArray[np.bool_] | None:
     if not any((side == 0).all(axis=-1).any() for side in (colors[0], colors[-1], colors[:, 0], colors[:, -1])):
         return None
     zero = np.ascontiguousarray((colors == 0).all(axis=-1)).view(np.uint8)
-    _, labels, found, _ = cv2.connectedComponentsWithStats(zero, connectivity=4)
-    at = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    at = at[(at > 0) & (found[at, cv2.CC_STAT_AREA] >= _SMALLEST_BORDER)]
-    if not at.size:
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(zero, connectivity=4)
+    borders = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    borders = borders[(borders > 0) & (statistics[borders, cv2.CC_STAT_AREA] >= _SMALLEST_BORDER)]
+    if not borders.size:
         return None
     inner = cv2.erode(zero, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    inside = np.bincount(labels[inner > 0], minlength=len(found))
-    at = at[inside[at] >= _THICK * found[at, cv2.CC_STAT_AREA]]
-    if not at.size or found[at, cv2.CC_STAT_AREA].sum() == zero.size:  # an image that is black altogether has no border
+    inside = np.bincount(labels[inner > 0], minlength=len(statistics))
+    borders = borders[inside[borders] >= _THICK * statistics[borders, cv2.CC_STAT_AREA]]
+    if not borders.size or statistics[borders, cv2.CC_STAT_AREA].sum() == zero.size:  # a black image has no border
         return None
-    chosen = np.zeros(len(found), np.bool_)
-    chosen[at] = True
-    border: NDArray[np.bool_] = chosen[labels]
+    is_border = np.zeros(len(statistics), np.bool_)
+    is_border[borders] = True
+    border: NDArray[np.bool_] = is_border[labels]
     return border
 
 

@@ -83,12 +83,12 @@ def fit_rows(matches: Matches, height: int, width: int, tolerance: float) -> Row
     regular = np.abs(np.linalg.det(systems)) > 1e-6 * height * width
     if not regular.any():
         return None
-    found = np.linalg.solve(systems[regular], off[triples[regular]][:, :, None])[:, :, 0]
-    found = found[np.abs(found[:, 1:]).max(axis=1) < _STEEPEST]
-    if not len(found):
+    models = np.linalg.solve(systems[regular], off[triples[regular]][:, :, None])[:, :, 0]
+    models = models[np.abs(models[:, 1:]).max(axis=1) < _STEEPEST]
+    if not len(models):
         return None
-    votes = (np.abs(found @ terms.T - off) < tolerance).sum(axis=1)
-    best = found[votes.argmax()]
+    votes = (np.abs(models @ terms.T - off) < tolerance).sum(axis=1)
+    best = models[votes.argmax()]
     for _ in range(_ROUNDS):
         agreeing = np.abs(terms @ best - off) < tolerance
         if agreeing.sum() < 3:

@@ -62,7 +62,7 @@ def test_a_bad_pair_has_one_warning(matcher, left, right, words):
 def test_a_matcher_looks_closely_ever_more_rarely(matcher, monkeypatch):
     looked = []
     monkeypatch.setattr("stereokit.checks.check_gray", lambda *_, **__: looked.append(calls) or check(*_, **__))
-    for calls in range(1, 10):
+    for calls in range(1, 10):  # noqa: B007, which `look` reads
         with collecting() as lines:
             matcher(RIGHT, LEFT)
             matcher(LEFT, RIGHT)  # a good one is not looked at
@@ -90,8 +90,8 @@ def test_density_decides():
     assert [min_density(levels) for levels in (2048, 128, 64, 32, 16, 8, 1)] == [0.3, 0.3, 0.35, 0.4, 0.45, 0.45, 0.45]
     for measured, number in ((0, "0.0 %"), (9, "9.0 %"), (34, "34 %"), (35, None), (100, None)):
         valid = (np.arange(100) < measured).reshape(10, 10)
-        found = Disparity(np.zeros((10, 10), np.float32), valid)
-        lines = density_warnings(found.density, -4, 60)
+        result = Disparity(np.zeros((10, 10), np.float32), valid)
+        lines = density_warnings(result.density, -4, 60)
         assert (not lines) if number is None else (f"only {number}" in lines[0] and "-4 .. 59" in lines[0])
 
 

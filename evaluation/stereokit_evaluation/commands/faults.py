@@ -79,8 +79,8 @@ def cases(left: Gray, right: Gray, other: Gray) -> Iterator[Case]:
     """Yield disturbances of a good pair; `other` is a view of another scene."""
 
     def case(name: str, kinds: str, one: Any, two: Any, *levels: int) -> Case:
-        views = (np.ascontiguousarray(view, np.uint8) for view in (one, two))
-        return Case(name, frozenset(kinds.split()), *views, *levels)
+        first, second = (np.ascontiguousarray(view, np.uint8) for view in (one, two))
+        return Case(name, frozenset(kinds.split()), first, second, *levels)
 
     for offset in (-10, -5, -2, -1, 1, 2, 5, 10):
         yield case(f"offset {abs(offset)} px", "rows", left, warped(right, offset))
@@ -111,7 +111,7 @@ def cases(left: Gray, right: Gray, other: Gray) -> Iterator[Case]:
 
 def main() -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--every", type=int, default=8)
@@ -127,7 +127,7 @@ def main() -> None:
         rows.writerow(["pair", "disturbance", "expected", "said", "warned"])
 
         def look(name: str, case: Case) -> tuple[set[str], int]:
-            levels = {"min_disparity": case.min_disparity, "max_disparity": case.max_disparity}
+            levels: dict[str, Any] = {"min_disparity": case.min_disparity, "max_disparity": case.max_disparity}
             report = check_pair(case.left, case.right, quick=options.quick, **levels)
             warned = 0
             if options.match:

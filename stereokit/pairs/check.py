@@ -46,7 +46,7 @@ _TOLERANCE = 1.0  # of rows, pixels of the image that is looked at
 _MAJORITY = 0.5  # of the points that agree
 _STILL = 0.25  # pixels of disparity that no point of a picture given twice has
 _OFFSET, _ROLL, _SCALE = 0.6, 0.15, 0.007  # pixels, degrees, a share: beyond these rows do not meet
-_ERRORS = 3.0  # standard errors that are added to those
+_ERRORS = 4.0  # standard errors that are added to those
 _TURN, _TURN_SPREAD = 8.0, 12.0  # degrees
 _INSIDE, _OUTSIDE = 0.2, 0.8  # shares of the points that lie in the range, and would if the views were exchanged
 _CLIPPED, _FEWEST_CLIPPED, _SLACK = 0.03, 6, 1.5  # share, points and pixels beyond an end of the range
@@ -239,12 +239,10 @@ def _usable(bad: NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np
 
 def _of_rows(rows: Rows, height: int, width: int) -> list[Fault]:
     """Return what is wrong with rows that are known."""
-    count = math.sqrt(rows.agreeing.sum())
-    error = _ERRORS * rows.spread / count
-    tilt = math.sqrt(12)  # the spread of what is even from one side to the other is its width over this
-    offset = abs(rows.offset) > _OFFSET + error
-    roll = abs(rows.roll_degrees) > _ROLL + math.degrees(error * tilt / width)
-    scale = abs(rows.scale) > _SCALE + error * tilt / height
+    of_offset, of_roll, of_scale = (_ERRORS * error for error in rows.errors)
+    offset = abs(rows.offset) > _OFFSET + of_offset
+    roll = abs(rows.roll_degrees) > _ROLL + math.degrees(of_roll)
+    scale = abs(rows.scale) > _SCALE + of_scale
     if not (offset or roll or scale):
         return []
     side = "lower" if rows.offset > 0 else "higher"

@@ -39,6 +39,8 @@ class Rows:
         Which do.
     spread : float
         Standard deviation of those from the fit, pixels.
+    errors : (float, float, float)
+        Standard errors of `offset`, `roll` and `scale`, which are large where the points lie close together.
     """
 
     offset: float
@@ -47,6 +49,7 @@ class Rows:
     share: float
     agreeing: NDArray[np.bool_]
     spread: float
+    errors: tuple[float, float, float]
 
     @property
     def roll_degrees(self) -> float:
@@ -96,4 +99,9 @@ def fit_rows(matches: Matches, height: int, width: int, tolerance: float) -> Row
     if agreeing.sum() < FEWEST:
         return None
     offset, roll, scale = (float(value) for value in best)
-    return Rows(offset, roll, scale, float(agreeing.mean()), agreeing, float(error[agreeing].std()))
+    spread = float(error[agreeing].std())
+    normal = terms[agreeing].T @ terms[agreeing]
+    if np.linalg.cond(normal) > 1e12:  # all on a line
+        return None
+    errors = spread * np.sqrt(np.diag(np.linalg.inv(normal)))
+    return Rows(offset, roll, scale, float(agreeing.mean()), agreeing, spread, (*map(float, errors),))  # type: ignore[arg-type]

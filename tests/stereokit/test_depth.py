@@ -135,8 +135,10 @@ def test_depth_and_points_on_the_command_line(pair):
         run(pair, *camera, "--depth", pair / "f.tiff", "--ply", pair / "f.ply", "--filled", "--frame", "ros").exit_code
         == 0
     )
-    assert np.isfinite(read_depth(pair / "f.tiff")).all()
-    assert len(cloud(pair / "f.ply")[1]) == 4000 and (cloud(pair / "f.ply")[1]["x"] > 0).all()
+    everything = read_depth(pair / "f.tiff")  # but what is filled with a disparity of 0, at infinity
+    assert np.isfinite(everything).sum() > np.isfinite(depth).sum() and np.isfinite(everything).mean() > 0.9
+    _, points = cloud(pair / "f.ply")
+    assert len(points) == np.isfinite(everything).sum() and (points["x"] > 0).all()
     assert run(pair, *camera, "--depth", pair / "n.npy", "--max-depth", 1.5).exit_code == 0
     assert np.isnan(read_depth(pair / "n.npy")).mean() > 0.9
     scaled = run(pair, "--calibration", pair / "half.json", "--calibration-scale", 2, "--depth", pair / "s.npy")
@@ -156,14 +158,14 @@ def test_depth_and_points_on_the_command_line(pair):
         (("--calibration", "{}/half.json", "--depth", "{}/x.png"), "50x20 pixels"),
         (("--memory", "2GB", "--calibration", "{}/camera.json", "--depth", "{}/x.png"), "--depth is not available"),
         (("--mask", "{}/none.png"), "no such file"),
-        (("--mask", "{}/d.pfm"), "not an image"),
+        (("--mask", "{}/broken.png"), "not an image"),
         (("--mask", "{}/small.png"), "--mask must have the size of the images, 100x40, got 3x2"),
         (("--nodata", "x"), "nodata"),
     ],
 )
 def test_bad_options_are_one_line(pair, words, message):
     write_image(pair / "small.png", np.ones((2, 3), np.uint8))
-    (pair / "d.pfm").write_bytes(b"x")
+    (pair / "broken.png").write_bytes(b"x")
     found = run(pair, *(word.format(pair) for word in words))
     assert found.exit_code == 2 and message in " ".join(found.output.split()).replace("│ ", "")
 

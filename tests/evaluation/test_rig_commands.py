@@ -293,3 +293,30 @@ def test_calibrate_a_folder(tmp_path):
 def test_what_calibrate_refuses(scene, tmp_path, words, line):
     output = run("calibrate", scene[0] / "raw", "-o", tmp_path / "rig.yml", *words, status=2)
     assert line in output and not (tmp_path / "rig.yml").exists()
+
+
+def test_live_rectifies_raw_frames_first(scene):
+    """The engine matches what the rig rectifies, leaves out what no sensor saw, and has the rectified depth."""
+    pytest.importorskip("aiohttp")
+    from stereokit import Matcher
+    from stereokit_evaluation.live.engine import Engine
+    from stereokit_evaluation.live.source import Folder
+
+    folder, _, images = scene
+    sizes = []
+
+    def rectify(size):
+        sizes.append(size)
+        return read_rig(folder / "rig.yml", size=size).rectification()
+
+    engine = Engine(Folder(folder / "raw", rate=200), rectify=rectify, max_disparity=64)
+    engine.start()
+    engine.thread.join()
+    rectification = read_rig(folder / "rig.yml").rectification()
+    expected = Matcher(max_disparity=64, confidence=True)(*rectification(*images), **rectification.masks)
+    assert sizes == [(WIDTH, HEIGHT)]  # one rectification for all frames
+    assert np.array_equal(engine.view.result.disparity, expected.disparity, equal_nan=True)
+    assert np.array_equal(engine.view.result.valid, expected.valid)
+    assert engine.calibration == rectification.calibration
+    x, y = WIDTH // 2, HEIGHT // 2
+    assert engine.at(x, y)["depth"] == pytest.approx(expected.depth(rectification.calibration)[y, x], rel=1e-5)

@@ -27,7 +27,7 @@ from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
-from stereokit.options import MatchOptions, StageOptions
+from stereokit.options import MatchOptions, StageOptions, WarmupOptions
 from stereokit.pipeline import CpuPipeline, Pipeline, concluded, with_blank
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["METHODS", "Matcher", "match", "warmup"]
+__all__ = ["METHODS", "Matcher", "compile_kernels", "match", "warmup"]
 
 
 class Matcher:
@@ -455,7 +455,7 @@ def _file_version(option: Any) -> Any:
     return option
 
 
-def warmup(*methods: str, max_disparity: int = 128) -> None:
+def warmup(*methods: str, max_disparity: int = 128, **options: Unpack[WarmupOptions]) -> None:
     """Compile the kernels of the methods (or load them from the disk cache), so that no later call waits for it.
 
     Parameters
@@ -464,11 +464,34 @@ def warmup(*methods: str, max_disparity: int = 128) -> None:
         Methods; none means S1 to S4.
     max_disparity : int
         As it will be used: code is compiled per 64 levels.
+    **options
+        Those of `Matcher`, as they will be used.
+
+    Raises
+    ------
+    OptionError
+        If an option cannot be used.
     """
-    image = np.arange(16 * 16, dtype=np.uint8).reshape(16, 16)
+    values: dict[str, Any] = {**options, "max_disparity": max_disparity}
     for method in methods or METHODS:
-        with collecting():
-            Matcher(method, max_disparity=max_disparity)(image, image)
+        compile_kernels(Matcher(method, **values))
+
+
+def compile_kernels(matcher: Matcher, shape: tuple[int, ...] = (), dtype: Any = np.uint8) -> None:
+    """Compile what a matcher needs for images of a type, so that a time taken afterwards is that of matching.
+
+    Parameters
+    ----------
+    matcher : Matcher
+    shape : tuple of int
+        ``()`` for grey images, ``(3,)`` or ``(4,)`` for colour.
+    dtype : numpy type
+    """
+    side = 320  # speckles are a share of the pixels: at a quarter of the size there must be some to remove
+    image = np.zeros((side, side, *shape), dtype)
+    image[:, ::2] = 1
+    with collecting():
+        matcher(image, image)
 
 
 def _forget_matchers() -> None:

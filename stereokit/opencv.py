@@ -89,14 +89,16 @@ class StereoSGBM:
     def matcher(self, pixels: int) -> Matcher:
         """Return the matcher for images of so many pixels: speckles are counted in pixels here, in shares there."""
         if pixels not in self._matchers:
-            given = self._parameters
+            parameters = self._parameters
             self._matchers[pixels] = Matcher(
                 "census+sgm",
-                min_disparity=given["minDisparity"],
-                max_disparity=given["minDisparity"] + given["numDisparities"],
-                uniqueness=given["uniquenessRatio"],
-                smp=given["disp12MaxDiff"] >= 0,
-                speckle=min((given["speckleWindowSize"] + 0.5) / pixels, 1) if given["speckleWindowSize"] else 0,
+                min_disparity=parameters["minDisparity"],
+                max_disparity=parameters["minDisparity"] + parameters["numDisparities"],
+                uniqueness=parameters["uniquenessRatio"],
+                smp=parameters["disp12MaxDiff"] >= 0,
+                speckle=min((parameters["speckleWindowSize"] + 0.5) / pixels, 1)
+                if parameters["speckleWindowSize"]
+                else 0,
                 fill=None,
             )
         return self._matchers[pixels]

@@ -1,7 +1,8 @@
 """Learned refiners: a network's weights behind the contract of `stereokit_refiners.contract`.
 
-The runtime is whatever is installed: OpenVINO first, then ONNX Runtime, then torch; and the precision what the
-processor is fast at: int8 where it has the instructions and the weights were calibrated, else bfloat16, else fp32.
+The runtime is what is installed: OpenVINO first, then ONNX Runtime, then torch, and OpenCV, which always is. The
+precision is what the processor is fast at: int8 where it has the instructions and the weights were calibrated, else
+bfloat16, else fp32.
 Before a process trusts a runtime with a network, it compares a small map with that of plain numpy
 (`stereokit_refiners.runtimes.reference`), and takes another runtime, with a warning, if they disagree. Networks
 compiled for a size are kept, a few at a time.
@@ -48,7 +49,8 @@ __all__ = [
     "learned_names",
 ]
 
-BACKENDS = ("openvino", "onnxruntime", "torch")
+BACKENDS = ("openvino", "onnxruntime", "torch", "opencv")
+"""The fastest first; the last comes with the base package."""
 PRECISIONS = ("fp32", "bf16", "int8")
 _MOST_COMPILED = 4  # networks
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
@@ -66,7 +68,7 @@ class LearnedRefiner:
     weights : str or None
         A weight file, or the name of an installed collection, such as ``"kitti"``; None takes those that come with the
         package.
-    backend : {"auto", "openvino", "onnxruntime", "torch"}
+    backend : {"auto", "openvino", "onnxruntime", "torch", "opencv"}
         What runs the network; "auto" is the first that is installed.
     precision : {"auto", "fp32", "bf16", "int8"}
         bf16 and int8 need OpenVINO. "auto" is the fastest that this processor has instructions for.
@@ -341,10 +343,8 @@ def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArra
 
 def _installed() -> list[str]:
     """Return the runtimes that are there, the best first."""
-    installed = [b for b in BACKENDS if importlib.util.find_spec(b) is not None]
-    if "onnxruntime" in installed and importlib.util.find_spec("onnx") is None:
-        installed.remove("onnxruntime")
-    return installed
+    installed = [name for name in BACKENDS[:-1] if importlib.util.find_spec(name) is not None]
+    return [*installed, "opencv"] if hasattr(cv2, "dnn") else installed
 
 
 def _backend(name: str) -> str:
@@ -354,13 +354,15 @@ def _backend(name: str) -> str:
     if name == "auto":
         if not installed:
             raise StereokitError(
-                "learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[refiners]', or "
-                "'stereokit[onnx]' where OpenVINO has no wheel"
+                "learned refiners need OpenCV's dnn, which this build lacks, or another runtime: pip install "
+                "'stereokit[refiners]', or 'stereokit[onnx]' where OpenVINO has no wheel"
             )
         return installed[0]
     if name not in installed:
-        extra = {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}[name]
-        raise StereokitError(f"backend {name!r} is not installed: pip install 'stereokit[{extra}]'")
+        way = {"openvino": "'stereokit[refiners]'", "onnxruntime": "'stereokit[onnx]'", "torch": "'stereokit[train]'"}
+        raise StereokitError(
+            f"backend {name!r} is not installed: pip install {way.get(name, 'opencv-python-headless')}"
+        )
     return name
 
 
@@ -428,6 +430,10 @@ def _compile(content: WeightFile, backend: str, precision: str, rows: int, colum
         from stereokit_refiners.runtimes.onnx import session
 
         return session(network, content.arrays, threads)
+    if backend == "opencv":
+        from stereokit_refiners.runtimes.opencv import compiled as compiled_by_opencv
+
+        return compiled_by_opencv(network, content.arrays, rows, columns, threads)
     from stereokit_refiners.runtimes.torch import runner
 
     return runner(network, content.arrays)

@@ -47,10 +47,10 @@ def test_what_is_packed_comes_back():
         for name, (channels, dtype) in training._FIELDS.items()
     }  # fmt: skip
     fields["input"] = rng.integers(-100, 100, (sum(CHANNELS.values()), 3, 5)) / training._INPUT_STEPS
-    found = training.unpacked(training.packed(fields))
+    unpacked = training.unpacked(training.packed(fields))
     for name, array in fields.items():
-        wanted = np.rint(array * training._INPUT_STEPS) if name == "input" else array
-        np.testing.assert_array_equal(found[name], wanted.transpose(1, 2, 0))
+        expected = np.rint(array * training._INPUT_STEPS) if name == "input" else array
+        np.testing.assert_array_equal(unpacked[name], expected.transpose(1, 2, 0))
 
 
 @pytest.mark.parametrize("step", [1, 2, 4])
@@ -59,27 +59,27 @@ def test_the_mixture_of_stored_samples_is_that_of_the_kernels(step):
     left, right, *_ = _pair()
     size = -(-left.shape[0] // step), -(-left.shape[1] // step)
     disparity, one, two = (rng.random((3, *size)) * 20 / step).astype(np.float32)
-    found = hypotheses(disparity, np.stack([one, two]), left, right, step)
-    head = rng.normal(size=(found.coarse.shape[0] // 4, found.coarse.shape[1] // 4, LOGITS + GAINS + 4))
+    fields = hypotheses(disparity, np.stack([one, two]), left, right, step)
+    head = rng.normal(size=(fields.coarse.shape[0] // 4, fields.coarse.shape[1] // 4, LOGITS + GAINS + 4))
     head = head.astype(np.float32)
-    wanted = compiled_mixture(head, found, *left.shape)[0]
+    expected = compiled_mixture(head, fields, *left.shape)[0]
 
-    half = np.mean([found.coarse[i::2, j::2] for i in (0, 1) for j in (0, 1)], axis=0)
+    half = np.mean([fields.coarse[i::2, j::2] for i in (0, 1) for j in (0, 1)], axis=0)
 
     def folded(plane, side):
         return training._folded(plane, side)
 
-    given = [
-        np.concatenate([folded(values - half, 2) for values in found.others]),
-        folded(found.coarse - half.repeat(2, 0).repeat(2, 1), 4), training._gains(found.around),
+    inputs = [
+        np.concatenate([folded(values - half, 2) for values in fields.others]),
+        folded(fields.coarse - half.repeat(2, 0).repeat(2, 1), 4), training._gains(fields.around),
     ]  # fmt: skip
-    tensors = [torch.from_numpy(part.astype(np.float32))[None] for part in (head.transpose(2, 0, 1), *given)]
-    apart = torch.tensor([float(found.apart)])
+    tensors = [torch.from_numpy(part.astype(np.float32))[None] for part in (head.transpose(2, 0, 1), *inputs)]
+    apart = torch.tensor([float(fields.apart)])
     less = training.mixture(*tensors, apart)[0].numpy()
-    height, width = found.coarse.shape
+    height, width = fields.coarse.shape
     full = less.reshape(4, 4, height // 4, width // 4).transpose(2, 0, 3, 1).reshape(height, width)
-    full = (full + found.coarse + found.base)[: left.shape[0], : left.shape[1]]
-    np.testing.assert_allclose(full, wanted, atol=1e-3)
+    full = (full + fields.coarse + fields.base)[: left.shape[0], : left.shape[1]]
+    np.testing.assert_allclose(full, expected, atol=1e-3)
 
 
 def test_samples_say_what_is_missing_and_who_sees_it():

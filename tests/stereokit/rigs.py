@@ -92,7 +92,7 @@ def _all_rays(rig: Rig, side: int, size: tuple[int, int]) -> np.ndarray:
 
 
 def texture(points: np.ndarray) -> np.ndarray:
-    """Return the grey level, 0 to 255, of points in space: waves of many directions and lengths, each with its phase."""
+    """Return the grey level, 0 to 255, of points in space: waves of many directions and lengths."""
     rng = np.random.default_rng(5)
     level = np.zeros(points.shape[:-1])
     for _ in range(60):
@@ -151,7 +151,7 @@ def board_pose(number: int, count: int, center: np.ndarray, distance=0.45) -> tu
 
 
 def board_image(rig: Rig, side: int, pose, draw, size=SIZE) -> np.ndarray:
-    """Return the raw image of a board, uint8; `draw` gives levels from 0 to 1 for places on it and a pixel's width there."""
+    """Return the raw image of a board, uint8; `draw` gives levels, 0 to 1, of places on it, a pixel being so wide."""
     turn, step = (np.eye(3), np.zeros(3)) if side == 0 else (rig.r, rig.t)
     turn, step = turn @ pose[0], turn @ pose[1] + step
     directions = rays(rig, side, size) @ turn  # in the board's frame

@@ -28,7 +28,7 @@ CALIBRATION = {"fx": 100, "fy": 100, "cx0": 0, "cy": 0, "baseline_m": 0.1}
 class FakeMatcher:
     """Finds disparity 10 everywhere but in the first column, and remembers how it was called."""
 
-    made: ClassVar[list[dict]] = []
+    instances: ClassVar[list[dict]] = []
     called = 0
     confident = True
     raises: BaseException | None = None
@@ -36,7 +36,7 @@ class FakeMatcher:
     def __init__(self, method="census+sgm", **options):
         if options.get("p1") == "bad":
             raise OptionError("p1 must be a number, got 'bad'")
-        FakeMatcher.made.append({"method": method, **options})
+        FakeMatcher.instances.append({"method": method, **options})
         self.method = {"S2": "census+sgm"}.get(method, method)
         self.max_disparity, self.min_disparity = options["max_disparity"], options["min_disparity"]
         self.refiner = options["refiner"]
@@ -58,7 +58,7 @@ def matching(monkeypatch):
     module.Matcher = FakeMatcher
     module.METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+sgm"}
     monkeypatch.setitem(sys.modules, "stereokit.matching", module)
-    monkeypatch.setattr(FakeMatcher, "made", [])
+    monkeypatch.setattr(FakeMatcher, "instances", [])
     for name, value in (("called", 0), ("confident", True), ("raises", None)):
         monkeypatch.setattr(FakeMatcher, name, value)
 
@@ -117,7 +117,7 @@ def test_match_writes_the_map(tmp_path, pair, suffix):
     np.testing.assert_array_equal(io.read_disparity(output), expected)
     assert "census+sgm" in result.stdout
     assert "87.5 %" in result.stdout
-    assert FakeMatcher.made == [
+    assert FakeMatcher.instances == [
         {
             "method": "census+sgm",
             "max_disparity": 128,
@@ -148,7 +148,7 @@ def test_match_passes_every_option(tmp_path, pair):
         ),
     )
     assert result.exit_code == 0, result.output
-    assert FakeMatcher.made == [
+    assert FakeMatcher.instances == [
         {
             "method": "S2",
             "max_disparity": 64,
@@ -172,8 +172,8 @@ def test_match_writes_everything_else(tmp_path, pair):
     options = [word for name, file in names.items() for word in (f"--{name}", tmp_path / file)]
     result = run("match", *pair, "-o", tmp_path / "d.png", *options, "--calibration", tmp_path / "calibration.json")
     assert result.exit_code == 0, result.output
-    assert FakeMatcher.made[0]["right"] is True
-    assert FakeMatcher.made[0]["confidence"] is True
+    assert FakeMatcher.instances[0]["right"] is True
+    assert FakeMatcher.instances[0]["confidence"] is True
     color = io.read_image(tmp_path / "c.png")
     assert color.shape == (HEIGHT, WIDTH, 3)
     assert (color[:, 0] == 0).all()

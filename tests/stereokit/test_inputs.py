@@ -141,9 +141,9 @@ def test_results_are_not_shared_with_later_calls():
     left, right = pair_of(seed=9)
     matcher = Matcher(METHOD, max_disparity=16, confidence=True, smp=False, median=0)
     first = matcher(left, right)
-    kept = first.disparity.copy(), first.valid.copy(), first.confidence.copy()
+    copies = first.disparity.copy(), first.valid.copy(), first.confidence.copy()
     matcher(right, left)
-    for array, copy in zip((first.disparity, first.valid, first.confidence), kept, strict=True):
+    for array, copy in zip((first.disparity, first.valid, first.confidence), copies, strict=True):
         np.testing.assert_array_equal(array, copy)
     assert first.disparity.flags.writeable
     assert not np.shares_memory(first.disparity, left)

@@ -138,9 +138,9 @@ def test_post_processing_is_consistency_speckles_filling_median(random_pair, met
         "max_disparity": 16,
     }
     result = Matcher(method, **in_full(method, **{**PLAIN, **options}))(left, right)
-    kept = remove_speckles(single_matching_phase(disparity, cost), 6)  # 0.01 of 640 pixels
-    np.testing.assert_array_equal(result.valid, ~np.isnan(kept))
-    np.testing.assert_array_equal(result.disparity, median(fill(kept, mode), 3))
+    consistent = remove_speckles(single_matching_phase(disparity, cost), 6)  # 0.01 of 640 pixels
+    np.testing.assert_array_equal(result.valid, ~np.isnan(consistent))
+    np.testing.assert_array_equal(result.disparity, median(fill(consistent, mode), 3))
     np.testing.assert_array_equal(result.confidence, np.where(result.valid, confidence, 0))
     assert 0 < result.density < 1
 
@@ -307,23 +307,23 @@ class Declining(Keeping):
 def test_a_refiner_that_needs_a_confidence_is_given_it(random_pair, method):
     left, right = random_pair(30, 50, seed=15)
     options = {"max_disparity": 16, "scale": 0.5}
-    kinds = [(kind(), asked) for kind in (Keeping, Declining, Needing) for asked in (False, True)]
-    for refiner, asked in kinds:
-        result = Matcher(method, refiner=refiner, confidence=asked, **options)(left, right)
-        assert (refiner.coarse.confidence is None) == (not asked and not isinstance(refiner, Needing))
-        if asked:
+    kinds = [(kind(), confidence) for kind in (Keeping, Declining, Needing) for confidence in (False, True)]
+    for refiner, confidence in kinds:
+        result = Matcher(method, refiner=refiner, confidence=confidence, **options)(left, right)
+        assert (refiner.coarse.confidence is None) == (not confidence and not isinstance(refiner, Needing))
+        if confidence:
             assert (result.confidence == 0.25).all()
         else:
             assert result.confidence is None  # whatever the refiner returns
-    given = [refiner.coarse for refiner, _ in kinds]
-    for coarse in given:
-        np.testing.assert_array_equal(coarse.disparity, given[0].disparity)
-        np.testing.assert_array_equal(coarse.valid, given[0].valid)
+    coarse_maps = [refiner.coarse for refiner, _ in kinds]
+    for coarse in coarse_maps:
+        np.testing.assert_array_equal(coarse.disparity, coarse_maps[0].disparity)
+        np.testing.assert_array_equal(coarse.valid, coarse_maps[0].valid)
         if coarse.confidence is not None:
             assert coarse.confidence.shape == (15, 25) and coarse.confidence.dtype == np.float32
-            np.testing.assert_array_equal(coarse.confidence, given[-1].confidence)
-    assert (given[-1].confidence[~given[-1].valid] == 0).all()
-    assert 0 <= given[-1].confidence.min() < given[-1].confidence.max() <= 1
+            np.testing.assert_array_equal(coarse.confidence, coarse_maps[-1].confidence)
+    assert (coarse_maps[-1].confidence[~coarse_maps[-1].valid] == 0).all()
+    assert 0 <= coarse_maps[-1].confidence.min() < coarse_maps[-1].confidence.max() <= 1
 
 
 class Choosing(Keeping):
@@ -429,8 +429,8 @@ def test_identity_is_what_a_map_depends_on():
     assert identity == Matcher("zncc+sgm", max_disparity=32, threads=2, device="cpu").identity()
     assert not {"threads", "device"} & set(identity)
     others = ({"p1": 0.5}, {"median": 3}, {"fill": None}, {"min_disparity": -1}, {"scale": 0.5}, {"window": 7})
-    found = [Matcher("S4", **{"max_disparity": 32, **options}).identity() for options in others]
-    assert all(other != identity for other in found)
+    identities = [Matcher("S4", **{"max_disparity": 32, **options}).identity() for options in others]
+    assert all(other != identity for other in identities)
 
 
 def test_the_old_name_of_the_border_cost_still_works():
@@ -449,10 +449,10 @@ def test_the_old_name_of_the_border_cost_still_works():
 def test_a_matcher_with_changes_leaves_the_first_as_it_was(random_pair):
     left, right = random_pair(20, 40)
     matcher = Matcher("S2", max_disparity=16)
-    changed = matcher.replaced(fill=None, median=0)
-    assert (changed.settings.fill, changed.settings.median) == (None, 0)
-    want = Matcher("S2", max_disparity=16, fill=None, median=0)(left, right)
-    np.testing.assert_array_equal(changed(left, right).disparity, want.disparity)
+    second = matcher.replaced(fill=None, median=0)
+    assert (second.settings.fill, second.settings.median) == (None, 0)
+    expected = Matcher("S2", max_disparity=16, fill=None, median=0)(left, right)
+    np.testing.assert_array_equal(second(left, right).disparity, expected.disparity)
     assert (matcher.settings.fill, matcher.settings.median) == ("nearest", 5)
     with pytest.raises(OptionError, match="median must be 0, 3 or 5"):
         matcher.replaced(median=4)

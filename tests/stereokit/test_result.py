@@ -102,9 +102,9 @@ def test_bad_ranges_and_maps_are_refused():
 
 def test_inputs_stay_as_they_are():
     strided = np.tile(MAP, (2, 2))[::2, ::-1]
-    kept = strided.copy()
+    original = strided.copy()
     colorize(strided)
-    np.testing.assert_array_equal(strided, kept)
+    np.testing.assert_array_equal(strided, original)
 
 
 def test_numpy_takes_a_result_as_its_map():

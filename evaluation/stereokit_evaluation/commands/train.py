@@ -1,9 +1,8 @@
-"""The command ``stereokit train``: a refiner for the maps of given matchers, from a data set, from streets, or both.
+"""The command ``stereokit train``: a refiner for the maps of one or more matchers, from data sets, streets, or both.
 
-The result is a folder with ``weights.safetensors`` (to be given as ``--refiner``), ``curves.csv``, ``curves.png``, and
-the checkpoint from which a killed run goes on when the same command is given again. With ``--folds`` each group of
-frames is held out once, and the pooled score over all of them is printed: an estimate for frames never seen, where the
-groups are whole drives.
+The result is a folder with ``weights.safetensors`` (for the option ``--refiner``), ``curves.csv``, ``curves.png``, and
+a checkpoint: after a kill the same command resumes from it. With ``--folds`` each group of frames is held out once, and
+the pooled score over all of them is printed: an estimate for unseen frames, where the groups are whole drives.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ __all__ = ["train"]
 
 
 def train(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the result; made if missing.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the result; created if missing.")],
     refiner: Annotated[str, typer.Option(help="Architecture: stereovae, cnn or pyramid.")] = "stereovae",
     dataset: Annotated[str | None, typer.Option(help=f"One of {', '.join(DATASETS)}.")] = None,
     root: Annotated[Path | None, typer.Option(help="Folder of the data set.")] = None,
     frames: Annotated[str | None, typer.Option(help="Frames to train on, such as 13-33,46.")] = None,
-    validation: Annotated[str | None, typer.Option(help="Frames to look at on the way.")] = None,
+    validation: Annotated[str | None, typer.Option(help="Frames to validate on.")] = None,
     folds: Annotated[str | None, typer.Option(help="Groups to hold out in turn: 0-3/13-17/18-33.")] = None,
     extra: Annotated[
         list[str] | None, typer.Option(metavar="DATASET:ROOT", help="More frames to train on, never held out.")
@@ -47,7 +46,7 @@ def train(
     cache: Annotated[Path | None, typer.Option(help="Folder of coarse maps; default OUTPUT/cache.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Train a refiner. Killed, it goes on from its checkpoint when called again with the same options."""
+    """Train a refiner. After a kill, the same command resumes from the checkpoint."""
     check_json(json_file)
     matchers = {"method": method} if method else {}
     document = run_training(

@@ -89,7 +89,7 @@ class Engine:
         self.listener = listener or (lambda: None)
         self.settings = {name: settings.pop(name, value) for name, value in defaults.items()}
         self._fixed = {"threads": threads, "device": device, **settings}
-        self._matcher = self._made(self.settings)
+        self._matcher = self._new_matcher(self.settings)
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._done: deque[float] = deque()
@@ -99,7 +99,7 @@ class Engine:
         self.ended = False
         self._thread = threading.Thread(target=self._run, name="stereokit live", daemon=True)
 
-    def _made(self, settings: dict[str, Any]) -> Matcher:
+    def _new_matcher(self, settings: dict[str, Any]) -> Matcher:
         check_number("confidence", settings["confidence"], 0, 1)
         options = {name: value for name, value in settings.items() if name != "confidence"}
         if options["scale"] == 1 and options["refiner"] == "linear":
@@ -129,7 +129,7 @@ class Engine:
             if name not in CHANGEABLE:
                 raise OptionError(f"settings that can change are {', '.join(CHANGEABLE)}, got {shown(name)}")
         settings = {**self.settings, **changes}
-        matcher = self._made(settings)
+        matcher = self._new_matcher(settings)
         with self._lock:
             self.settings, self._matcher = settings, matcher
         return settings

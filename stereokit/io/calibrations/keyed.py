@@ -43,6 +43,7 @@ _HEIGHTS = ("imageheight", "height", "imgheight", "imageh", "h", "rows")
 _SIZES = ("imagesize", "imgsize", "size", "resolution", "imageresolution", "framesize", "calibrationsize", "rawsize")
 _SHAPES = ("imageshape", "imgshape", "shape")  # height and width, as arrays have them
 _MODELS = ("cameramodel", "distortionmodel", "model", "lensmodel", "cameratype")
+_XI = frozenset(("xi", "xi1", "xi2", "xil", "xir", "xileft", "xiright", "leftxi", "rightxi"))
 _FLAGS = ("fisheye", "isfisheye", "usefisheye")
 
 
@@ -145,6 +146,11 @@ def from_keys(kind: str, values: dict[str, Any]) -> Content:
         If something in it is wrong.
     """
     fields = _Fields(values)
+    if _XI & values.keys():
+        raise OptionError(
+            "the camera model must be pinhole or equidistant fisheye, got an omnidirectional one (it has xi, as of "
+            "cv2.omnidir); calibrate as a fisheye, or undistort the images with cv2.omnidir first"
+        )
     unit = values.get("unit", values.get("units"))
     if unit is not None and unit not in UNITS:
         raise OptionError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")

@@ -9,9 +9,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 WORDS = frozenset(("found", "given", "held", "kept", "made", "told"))
-ROOTS = ("docs", "evaluation", "examples", "stereokit", "tests")
+ROOTS = ("docs", "evaluation", "examples", "refiners", "stereokit", "tests")
 PENDING = (
     "evaluation/stereokit_evaluation/synthetic/",  # a digest of these sources names the files of rendered pairs
+    "refiners/stereokit_refiners/runtimes/evidence.py",
+    "refiners/stereokit_refiners/runtimes/mixture.py",
+    "refiners/stereokit_refiners/training/evidence.py",
     "stereokit/aggregation/",
     "stereokit/costs/",
     "stereokit/cuda/",
@@ -22,6 +25,8 @@ PENDING = (
     "tests/gpu/",
     "tests/oracles.py",
     "tests/ptx/",
+    "tests/refiners/test_evidence.py",
+    "tests/refiners/test_evidence_training.py",
     "tests/stereokit/test_costs.py",
     "tests/stereokit/test_dt.py",
     "tests/stereokit/test_kernels.py",

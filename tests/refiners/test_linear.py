@@ -28,10 +28,10 @@ def coarse_of(size, seed=0, gaps=0.0):
 @pytest.mark.parametrize("size", SIZES)
 def test_the_map_doubles_in_size_and_in_value(size):
     coarse = coarse_of(size)
-    kept = coarse.disparity.copy()
+    original = coarse.disparity.copy()
     fine = Linear()(coarse, np.zeros(size, np.uint8))
     np.testing.assert_allclose(fine.disparity, 2 * oracles.double(coarse.disparity, *size), rtol=1e-5)
-    np.testing.assert_array_equal(coarse.disparity, kept)
+    np.testing.assert_array_equal(coarse.disparity, original)
     assert fine.disparity.dtype == np.float32
     assert fine.disparity.shape == fine.valid.shape == fine.confidence.shape == size
 
@@ -78,8 +78,8 @@ def test_tensors_are_upscaled_to_the_same_bits(size):
     from stereokit_refiners.runtimes.tensors import upscaled
 
     image = coarse_of(size, 5, gaps=0.05).disparity
-    found = upscaled(torch.from_numpy(image), 2, *size).numpy()
-    np.testing.assert_array_equal(found, upscaled_by_loops(image, *size))
+    actual = upscaled(torch.from_numpy(image), 2, *size).numpy()
+    np.testing.assert_array_equal(actual, upscaled_by_loops(image, *size))
 
 
 def test_gaps_stay_gaps_and_reach_no_further_than_their_neighbours():

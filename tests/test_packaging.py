@@ -56,8 +56,8 @@ def test_the_licence_is_in_the_metadata():
 
 def test_weights_that_are_not_for_commercial_use_are_a_distribution_of_their_own():
     folder = pytest.importorskip("stereokit_kitti_weights").__path__[0]
-    content = metadata("stereokit-kitti-weights")
-    assert content["License-Expression"] == "CC-BY-NC-SA-3.0"
+    description = metadata("stereokit-kitti-weights")
+    assert description["License-Expression"] == "CC-BY-NC-SA-3.0"
     assert "CC BY-NC-SA 3.0" in (ROOT / "refiners/kitti/LICENSE").read_text(encoding="utf-8")
     assert {path.stem for path in Path(folder).glob("*.safetensors")} == {"cnn", "pyramid", "stereovae"}
 

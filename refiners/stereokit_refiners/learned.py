@@ -212,6 +212,16 @@ class LearnedRefiner:
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
+    def check_runtime(self) -> None:
+        """Choose the runtime now rather than at the first map.
+
+        Raises
+        ------
+        StereokitError
+            If none that is installed computes the network rightly here.
+        """
+        self._compiled.settle()
+
     def network_map(
         self, disparity: NDArray[np.float32], candidates: NDArray[np.float32] | None,
         confidence: NDArray[np.float32] | None, left: NDArray[Any], threads: int = 1,
@@ -279,9 +289,9 @@ class LearnedRefiner:
         gaps = bool(unknown.any())
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
-        found = hypotheses(disparity, coarse.candidates, left, right, step, threads)
-        inputs = {"evidence": network_input(found, coarse.confidence, left, columns, threads)}
-        full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
+        values = hypotheses(disparity, coarse.candidates, left, right, step, threads)
+        inputs = {"evidence": network_input(values, coarse.confidence, left, columns, threads)}
+        full, sure = mixture(self._compiled.run(inputs, threads), values, rows, columns, threads)
         known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
         if gaps:
             missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
@@ -414,7 +424,7 @@ def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, 
                 raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {reasons}")
             if wrong:
                 line = f"network {content.network!r} is run by {way[0]} in {way[1]}, since on this machine "
-                warnings.warn(line + "; ".join(wrong), RuntimeWarning, stacklevel=5)
+                warnings.warn(line + "; ".join(wrong), RuntimeWarning, stacklevel=6)
             _sound[key] = way
         return _sound[key]
 
@@ -448,13 +458,18 @@ class _Compiled:
         self._lock = threading.Lock()
         self.warned = False
 
+    def settle(self) -> None:
+        """Take the backend and precision that compute the network rightly here."""
+        with self._lock:
+            if not self._runs:
+                self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
+
     def run(self, inputs: dict[str, NDArray[Any]], threads: int) -> NDArray[np.float32]:
         """Return the head for encoded inputs."""
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)
+        self.settle()
         with self._lock:
-            if not self._runs:
-                self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
             runner = self._runs.pop(key, None) or _compile(
                 self.content, self.backend, self.precision, rows, columns, threads
             )

@@ -41,9 +41,9 @@ def random_content(name, seed=0, output_mode="residual", ranges=None, last=0.05)
     return WeightFile(name, output_mode, random_arrays(name, seed, last), ranges or {}, {"note": "random"})
 
 
-def weight_file(folder, name, seed=0, **options):
+def weight_file(folder, name, seed=0, **arguments):
     path = folder / f"{name}-{seed}.safetensors"
-    write(path, random_content(name, seed, **options))
+    write(path, random_content(name, seed, **arguments))
     return str(path)
 
 

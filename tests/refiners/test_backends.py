@@ -69,8 +69,8 @@ def test_heads_of_the_papers_networks_against_loops(name, backend):
     assert head.dtype == np.float32
     assert head.flags.c_contiguous
     y, _, _ = stereovae_by_loops(arrays, inputs["disparity"], inputs["image"], name == "stereovae")
-    pixels = oracles.phases_to_pixels(head.transpose(2, 0, 1))
-    np.testing.assert_allclose(pixels, y[0], rtol=0, atol=2e-5 * np.abs(y).max())
+    actual = oracles.phases_to_pixels(head.transpose(2, 0, 1))
+    np.testing.assert_allclose(actual, y[0], rtol=0, atol=2e-5 * np.abs(y).max())
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -169,8 +169,8 @@ def test_calls_from_four_threads_at_once_are_single_calls(backend):
     def work(k):
         start.wait()
         for _ in range(8):
-            disparity = fresh(coarse_of(sizes[k], k), image_of(sizes[k], k)).disparity
-            if not np.array_equal(disparity, expected[k]):
+            actual = fresh(coarse_of(sizes[k], k), image_of(sizes[k], k)).disparity
+            if not np.array_equal(actual, expected[k]):
                 wrong.append(k)
 
     workers = [threading.Thread(target=work, args=(k,)) for k in range(4)]

@@ -60,9 +60,9 @@ def test_tensors_copy_the_same_candidate(choice, size):
     from stereokit_refiners.runtimes.tensors import TensorRefiner
 
     coarse = coarse_of(size, 1)
-    inputs = coarse.disparity, coarse.confidence, image_of(size, 1), coarse.candidates
-    disparity = TensorRefiner(choosing(choice), "cpu")(*inputs).numpy()
-    np.testing.assert_allclose(disparity, chosen(coarse.candidates, choice, size), rtol=1e-6)
+    arguments = coarse.disparity, coarse.confidence, image_of(size, 1), coarse.candidates
+    actual = TensorRefiner(choosing(choice), "cpu")(*arguments).numpy()
+    np.testing.assert_allclose(actual, chosen(coarse.candidates, choice, size), rtol=1e-6)
 
 
 @pytest.mark.parametrize("choice", CHOICES)
@@ -72,15 +72,15 @@ def test_exported_graphs_copy_the_same_candidate(choice):
 
     size = (16, 32)
     coarse, left = coarse_of(size, 1), image_of(size, 1).astype(np.float32)
-    inputs = {
+    arguments = {
         "coarse": coarse.disparity,
         "confidence": coarse.confidence,
         "left": left,
         "candidates": coarse.candidates,
     }
     session = onnxruntime.InferenceSession(onnx_model(choosing(choice)), providers=["CPUExecutionProvider"])
-    (disparity,) = session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in inputs.items()})
-    np.testing.assert_allclose(disparity[0, 0], chosen(coarse.candidates, choice, size), rtol=1e-6)
+    (actual,) = session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in arguments.items()})
+    np.testing.assert_allclose(actual[0, 0], chosen(coarse.candidates, choice, size), rtol=1e-6)
 
 
 def test_candidates_do_not_fill_gaps_of_the_map():
@@ -102,8 +102,8 @@ def test_candidates_are_read_in_any_layout(size):
     wide[..., 1] = coarse.candidates
     for other in (np.asfortranarray(coarse.candidates), wide[..., 1], coarse.candidates[::-1].copy()[::-1]):
         assert not other.flags.c_contiguous
-        disparity = refiner(dataclasses.replace(coarse, candidates=other), left).disparity
-        np.testing.assert_array_equal(disparity, expected)
+        actual = refiner(dataclasses.replace(coarse, candidates=other), left).disparity
+        np.testing.assert_array_equal(actual, expected)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -52,16 +52,16 @@ def exact(request):
 @pytest.mark.parametrize("size", SIZES)
 def test_shapes_types_and_untouched_inputs(refiner, size):
     coarse, left = coarse_of(size, gaps=0.1), image_of(size)
-    copies = [np.copy(a) for a in (*vars(coarse).values(), left) if a is not None]
+    original = [np.copy(a) for a in (*vars(coarse).values(), left) if a is not None]
     fine = refiner(coarse, left)
     for array, dtype in ((fine.disparity, np.float32), (fine.valid, np.bool_), (fine.confidence, np.float32)):
         assert array.shape == size
         assert array.dtype == dtype
-    for before, after in zip(copies, (a for a in (*vars(coarse).values(), left) if a is not None), strict=True):
+    for before, after in zip(original, (a for a in (*vars(coarse).values(), left) if a is not None), strict=True):
         np.testing.assert_array_equal(before, after)
-    for output in (fine.disparity, fine.valid, fine.confidence):
-        for input_ in (coarse.disparity, coarse.valid, coarse.confidence, coarse.candidates, left):
-            assert not np.shares_memory(output, input_)
+    for mine in (fine.disparity, fine.valid, fine.confidence):
+        for theirs in (coarse.disparity, coarse.valid, coarse.confidence, coarse.candidates, left):
+            assert not np.shares_memory(mine, theirs)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -103,9 +103,9 @@ def test_disparities_below_zero_are_refined_like_those_above(exact, down):
     above = dataclasses.replace(coarse, disparity=coarse.disparity.copy(), candidates=np.abs(coarse.candidates))
     above.disparity[:2] = above.candidates[0, 0, 0] = 0  # so that both have the same lowest level
     below = dataclasses.replace(above, disparity=above.disparity - np.float32(down), candidates=above.candidates - down)
-    result, expected = exact(below, left), exact(above, left)
-    np.testing.assert_allclose(result.disparity, expected.disparity - 2 * down, rtol=0, atol=2e-3)
-    np.testing.assert_array_equal(result.valid, expected.valid)
+    actual, expected = exact(below, left), exact(above, left)
+    np.testing.assert_allclose(actual.disparity, expected.disparity - 2 * down, rtol=0, atol=2e-3)
+    np.testing.assert_array_equal(actual.valid, expected.valid)
 
 
 @pytest.mark.parametrize("size", [(33, 47), (1, 9)])
@@ -121,19 +121,19 @@ def test_the_same_call_gives_the_same_bits_with_any_threads(refiner, size):
 
 def test_results_of_earlier_calls_stay(refiner):
     first = refiner(coarse_of((16, 16)), image_of((16, 16))).disparity
-    copy = first.copy()
+    original = first.copy()
     refiner(coarse_of((16, 16), 1), image_of((16, 16), 1))
-    np.testing.assert_array_equal(first, copy)
+    np.testing.assert_array_equal(first, original)
 
 
 def test_four_threads_at_once(refiner):
     sizes = [(20, 30), (33, 17), (20, 30), (9, 40)]
     expected = [refiner(coarse_of(s, k), image_of(s, k)).disparity for k, s in enumerate(sizes)]
-    results = [None] * 4
+    actual = [None] * 4
 
     def work(k):
         for _ in range(3):
-            results[k] = refiner(coarse_of(sizes[k], k), image_of(sizes[k], k)).disparity
+            actual[k] = refiner(coarse_of(sizes[k], k), image_of(sizes[k], k)).disparity
 
     workers = [threading.Thread(target=work, args=(k,)) for k in range(4)]
     for worker in workers:
@@ -141,7 +141,7 @@ def test_four_threads_at_once(refiner):
     for worker in workers:
         worker.join()
     for k in range(4):
-        np.testing.assert_array_equal(results[k], expected[k])
+        np.testing.assert_array_equal(actual[k], expected[k])
 
 
 @pytest.mark.parametrize("size", [(33, 47), (31, 18), (9, 9), (1, 9)])
@@ -150,14 +150,14 @@ def test_odd_sizes_are_the_image_extended_by_hand_and_cut(exact, size):
     coarse, left = coarse_of(size, low=0.0, high=6.0), image_of(size)  # begins as maps of the training do
     height, width = half_of(size)
     stride = NETWORKS[exact._file.network].stride
-    below, right = -height % stride, -width % stride
+    below, beside = -height % stride, -width % stride
     by_hand = Disparity(
-        np.pad(coarse.disparity, ((0, below), (0, right)), mode="edge"),
-        np.pad(coarse.valid, ((0, below), (0, right)), mode="edge"),
-        np.pad(coarse.confidence, ((0, below), (0, right)), mode="edge"),
-        candidates=np.pad(coarse.candidates, ((0, 0), (0, below), (0, right)), mode="edge"),
+        np.pad(coarse.disparity, ((0, below), (0, beside)), mode="edge"),
+        np.pad(coarse.valid, ((0, below), (0, beside)), mode="edge"),
+        np.pad(coarse.confidence, ((0, below), (0, beside)), mode="edge"),
+        candidates=np.pad(coarse.candidates, ((0, 0), (0, below), (0, beside)), mode="edge"),
     )
-    whole = 2 * (height + below), 2 * (width + right)
+    whole = 2 * (height + below), 2 * (width + beside)
     extended = np.pad(left, ((0, whole[0] - rows), (0, whole[1] - columns)), mode="edge")
     expected = exact(by_hand, extended).disparity
     assert expected.shape == whole
@@ -251,10 +251,8 @@ def test_fingerprints_say_what_the_result_depends_on(tmp_path):
         random_content("cnn", output_mode="direct"),
         random_content("cnn", ranges=flat_ranges("cnn", 2)),
     ]
-    fingerprints = {LearnedRefiner.of(content, precision="auto").fingerprint for content in others} | {
-        first.fingerprint
-    }
-    assert len(fingerprints) == 4
+    actual = {LearnedRefiner.of(content, precision="auto").fingerprint for content in others} | {first.fingerprint}
+    assert len(actual) == 4
     assert first.fingerprint.endswith(f"-{first.backend}-{first.precision}")
 
 

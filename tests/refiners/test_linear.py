@@ -58,8 +58,8 @@ def upscaled_by_loops(image, height, width):
         other = min(max(y // 2 + (1 if y % 2 else -1), 0), rows - 1)
         line = [np.float32(2) * (near * image[y // 2, x] + far * image[other, x]) for x in range(columns)]
         for x in range(width):
-            neighbour = min(max(x // 2 + (1 if x % 2 else -1), 0), columns - 1)
-            out[y, x] = near * line[x // 2] + far * line[neighbour]
+            beside = min(max(x // 2 + (1 if x % 2 else -1), 0), columns - 1)
+            out[y, x] = near * line[x // 2] + far * line[beside]
     return out
 
 
@@ -78,8 +78,8 @@ def test_tensors_are_upscaled_to_the_same_bits(size):
     from stereokit_refiners.runtimes.tensors import upscaled
 
     image = coarse_of(size, 5, gaps=0.05).disparity
-    result = upscaled(torch.from_numpy(image), 2, *size).numpy()
-    np.testing.assert_array_equal(result, upscaled_by_loops(image, *size))
+    actual = upscaled(torch.from_numpy(image), 2, *size).numpy()
+    np.testing.assert_array_equal(actual, upscaled_by_loops(image, *size))
 
 
 def test_gaps_stay_gaps_and_reach_no_further_than_their_neighbours():

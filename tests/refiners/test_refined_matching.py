@@ -30,8 +30,8 @@ def path(tmp_path):
     return weight_file(tmp_path, "stereovae")
 
 
-def matcher(**options):
-    return stereokit.Matcher(**{**METHOD, **options})
+def matcher(**arguments):
+    return stereokit.Matcher(**{**METHOD, **arguments})
 
 
 class Keeping:
@@ -69,9 +69,9 @@ def test_the_refiner_sees_the_half_size_map_and_the_full_size_image(pair, path):
     np.testing.assert_array_equal(keeping.left, pair[0])
     assert keeping.threads == 2
     expected = LearnedRefiner(path)(keeping.coarse, pair[0])
-    result = matcher(refiner=path, confidence=True)(*pair)
-    np.testing.assert_array_equal(result.disparity, expected.disparity)
-    np.testing.assert_array_equal(result.confidence, expected.confidence)
+    actual = matcher(refiner=path, confidence=True)(*pair)
+    np.testing.assert_array_equal(actual.disparity, expected.disparity)
+    np.testing.assert_array_equal(actual.confidence, expected.confidence)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -79,12 +79,12 @@ def test_a_matcher_gives_the_confidence_and_keeps_it_back_unless_asked(pair, tmp
     path, keeping = weight_file(tmp_path, name), Keeping()
     matcher(refiner=keeping, confidence=True)(*pair)
     expected = LearnedRefiner(path)(keeping.coarse, pair[0])
-    plain, confident = (matcher(refiner=path, confidence=confidence)(*pair) for confidence in (False, True))
-    for result in (plain, confident):
-        np.testing.assert_array_equal(result.disparity, expected.disparity)
-        np.testing.assert_array_equal(result.valid, expected.valid)
+    plain, asked = (matcher(refiner=path, confidence=confidence)(*pair) for confidence in (False, True))
+    for actual in (plain, asked):
+        np.testing.assert_array_equal(actual.disparity, expected.disparity)
+        np.testing.assert_array_equal(actual.valid, expected.valid)
     assert plain.confidence is None
-    np.testing.assert_array_equal(confident.confidence, expected.confidence)
+    np.testing.assert_array_equal(asked.confidence, expected.confidence)
     assert [r.confidence for r in matcher(refiner=path, threads=2).map([pair] * 3)] == [None] * 3
 
 
@@ -98,11 +98,11 @@ def test_refiners_by_name_with_a_collection_of_weights(pair, name):
 
 @pytest.mark.parametrize("backend", LEARNED)
 def test_options_reach_the_refiner(pair, path, backend):
-    refined_matcher = matcher(refiner=path, backend=backend, precision="fp32")
-    assert (refined_matcher.refine.backend, refined_matcher.refine.precision) == (backend, "fp32")
+    subject = matcher(refiner=path, backend=backend, precision="fp32")
+    assert (subject.refine.backend, subject.refine.precision) == (backend, "fp32")
     expected = LearnedRefiner(path, backend=backend, precision="fp32").fingerprint
-    assert refined_matcher.refine.fingerprint == expected
-    assert refined_matcher(*pair).disparity.shape == pair[0].shape
+    assert subject.refine.fingerprint == expected
+    assert subject(*pair).disparity.shape == pair[0].shape
 
 
 def test_unknown_options_are_refused_with_the_known_ones(path):
@@ -133,9 +133,9 @@ def test_errors_come_when_the_matcher_is_made(tmp_path, path):
         "must be one of auto, fp32": {"refiner": path, "precision": "fp8"},
         "must be its own": {"refiner": "cnn", "weights": path},
     }
-    for message, options in cases.items():
+    for message, arguments in cases.items():
         with pytest.raises(StereokitError, match=message) as caught:
-            matcher(**options)
+            matcher(**arguments)
         one_line(caught.value)
 
 
@@ -149,11 +149,11 @@ def test_a_sequence_is_single_calls_in_order(path):
     rng = np.random.default_rng(2)
     sizes = [(40, 64), (40, 64), (33, 47), (40, 64), (16, 50), (40, 64)]
     pairs = [tuple(rng.integers(0, 256, (2, *size)).astype(np.uint8)) for size in sizes]
-    refined_matcher = matcher(refiner=path, threads=2)
+    subject = matcher(refiner=path, threads=2)
     expected = [matcher(refiner=path, threads=1)(*p) for p in pairs]
-    results = list(refined_matcher.map(pairs))
-    assert len(results) == len(pairs)
-    for one, other in zip(results, expected, strict=True):
+    actual = list(subject.map(pairs))
+    assert len(actual) == len(pairs)
+    for one, other in zip(actual, expected, strict=True):
         np.testing.assert_array_equal(one.disparity, other.disparity)
         np.testing.assert_array_equal(one.valid, other.valid)
 
@@ -161,36 +161,36 @@ def test_a_sequence_is_single_calls_in_order(path):
 def test_match_uses_the_refiner_that_it_is_given(pair):
     options = {**METHOD, "method": "census+sgm"}
     refiners = [LearnedRefiner.of(random_content("cnn", seed, last=0.5)) for seed in (0, 1)]
-    results = [stereokit.match(*pair, refiner=refiner, **options) for refiner in refiners]
+    actual = [stereokit.match(*pair, refiner=refiner, **options) for refiner in refiners]
     expected = [matcher(refiner=refiner)(*pair).disparity for refiner in refiners]
-    np.testing.assert_array_equal(results[0], expected[0])
-    np.testing.assert_array_equal(results[1], expected[1])
+    np.testing.assert_array_equal(actual[0], expected[0])
+    np.testing.assert_array_equal(actual[1], expected[1])
 
 
 def test_gaps_survive_without_fill(pair, path):
     coarse_gaps = matcher(fill=None, median=0, smp=True)(*pair)
-    result = matcher(refiner=path, fill=None, median=0, smp=True)(*pair)
-    assert np.isnan(result.disparity).any()
-    assert not result.valid[np.isnan(result.disparity)].any()
-    assert np.isnan(coarse_gaps.disparity[np.isnan(result.disparity)]).all()
+    actual = matcher(refiner=path, fill=None, median=0, smp=True)(*pair)
+    assert np.isnan(actual.disparity).any()
+    assert not actual.valid[np.isnan(actual.disparity)].any()
+    assert np.isnan(coarse_gaps.disparity[np.isnan(actual.disparity)]).all()
 
 
 def test_negative_ranges_and_color_pairs(pair, path):
-    result = matcher(refiner=path, min_disparity=-16)(*(np.dstack([view] * 3) for view in pair))
-    assert result.disparity.shape == pair[0].shape
-    assert np.isfinite(result.disparity).all()
+    actual = matcher(refiner=path, min_disparity=-16)(*(np.dstack([view] * 3) for view in pair))
+    assert actual.disparity.shape == pair[0].shape
+    assert np.isfinite(actual.disparity).all()
 
 
 def test_the_right_view_is_refined_too(pair, path):
-    result = matcher(refiner=path, right=True)(*pair)
+    actual = matcher(refiner=path, right=True)(*pair)
     mirrored = matcher(refiner=path)(pair[1][:, ::-1].copy(), pair[0][:, ::-1].copy())
-    np.testing.assert_array_equal(result.right, mirrored.disparity[:, ::-1])
+    np.testing.assert_array_equal(actual.right, mirrored.disparity[:, ::-1])
 
 
 def test_a_pickled_matcher_is_the_same(pair, path):
-    refined_matcher = matcher(refiner=path)
-    again = pickle.loads(pickle.dumps(refined_matcher))
-    np.testing.assert_array_equal(again(*pair).disparity, refined_matcher(*pair).disparity)
+    subject = matcher(refiner=path)
+    again = pickle.loads(pickle.dumps(subject))
+    np.testing.assert_array_equal(again(*pair).disparity, subject(*pair).disparity)
 
 
 def test_the_command_match_takes_a_weight_file(pair, path, tmp_path):

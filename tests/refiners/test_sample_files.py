@@ -40,11 +40,11 @@ def path(stored, tmp_path):
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_what_is_cached_is_what_was_made(pair, number, tmp_path, monkeypatch):
     folder = tmp_path / "not" / "there"
-    sample = load_variant(pair, "S2", 0, number, 32, folder)
-    assert_same(sample, load_variant(pair, "S2", 0, number, 32))
+    subject = load_variant(pair, "S2", 0, number, 32, folder)
+    assert_same(subject, load_variant(pair, "S2", 0, number, 32))
     assert [p.name for p in folder.iterdir()] == [cache_name(pair, "S2", 0, number, 32)]
     monkeypatch.setattr(samples, "make_variant", None)  # from here on only the cache can answer
-    assert_same(load_variant(pair, "S2", 0, number, 32, folder), sample)
+    assert_same(load_variant(pair, "S2", 0, number, 32, folder), subject)
 
 
 def test_a_variant_is_stored_once_where_its_name_says(pair, tmp_path, monkeypatch):
@@ -119,12 +119,12 @@ def test_a_shelf_reads_each_time_and_only_what_is_asked_for(path):
 )
 def test_slices_of_a_shelf_are_shelves(part, stored):
     shelf = SampleFiles(stored)
-    slice_ = shelf[part]
-    assert isinstance(slice_, SampleFiles)
-    assert len(slice_) == len(stored[part])
-    for sample, path in zip(slice_, stored[part], strict=True):
+    actual = shelf[part]
+    assert isinstance(actual, SampleFiles)
+    assert len(actual) == len(stored[part])
+    for sample, path in zip(actual, stored[part], strict=True):
         assert_same(sample, SampleFiles([path])[0])
-    assert slice_.digest == SampleFiles(stored[part]).digest
+    assert actual.digest == SampleFiles(stored[part]).digest
 
 
 def test_a_slice_reads_nothing(tmp_path):
@@ -153,14 +153,14 @@ def test_a_shelf_trains_as_its_samples_do(stored, tmp_path):
     from stereokit_refiners.training.loop import Source, calibrated, restored
 
     network, shelf = NETWORKS["pyramid"], SampleFiles(stored)
-    samples = list(shelf)
+    original = list(shelf)
     checkpoint = tmp_path / "checkpoint.pt"
     arrays, history = fit(network, [Source(shelf)], shelf[:1], settings(steps=3), checkpoint=checkpoint)
-    expected, other = fit(network, [Source(samples)], samples[:1], settings(steps=3))
+    expected, other = fit(network, [Source(original)], original[:1], settings(steps=3))
     same_arrays(arrays, expected)
     assert history.rows == other.rows
     module = restored(network, arrays)
-    assert calibrated(module, "residual", [Source(shelf)]) == calibrated(module, "residual", [Source(samples)])
+    assert calibrated(module, "residual", [Source(shelf)]) == calibrated(module, "residual", [Source(original)])
     again = fit(network, [Source(SampleFiles(stored))], shelf[:1], settings(steps=3), checkpoint=checkpoint)
     same_arrays(again[0], arrays)
     with pytest.raises(ValueError, match="checkpoint"):
@@ -208,9 +208,9 @@ def test_a_cut_file(path, keep):
 
 
 @pytest.mark.parametrize("at", [0.1, 0.3, 0.5, 0.7])
-def test_a_file_with_a_wrong_bit(path, offset):
+def test_a_file_with_a_wrong_bit(path, at):
     content = bytearray(path.read_bytes())
-    content[int(len(content) * offset)] ^= 1
+    content[int(len(content) * at)] ^= 1
     path.write_bytes(content)
     assert "CRC" in refused(path)
 

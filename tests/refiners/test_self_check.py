@@ -60,10 +60,10 @@ def test_plain_numpy_is_torchs_network(name):
     from stereokit_refiners.runtimes.torch import runner
 
     inputs, arrays = encoded_of(name, 16, 32), random_arrays(name, last=1.0)
-    output = reference.forward(NETWORKS[name], arrays, inputs)
+    actual = reference.forward(NETWORKS[name], arrays, inputs)
     expected = runner(NETWORKS[name], arrays)(inputs)
-    assert output.shape == expected.shape and output.dtype == np.float32 and torch is not None
-    np.testing.assert_allclose(output, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+    assert actual.shape == expected.shape and actual.dtype == np.float32 and torch is not None
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16", "int8"])
@@ -93,10 +93,10 @@ def test_a_wrong_runtime_gives_way_to_another_with_one_warning(broken):
     rule = (
         rf"^network 'cnn' is run by {second} in fp32, since on this machine {first} in fp32 is off by 2 px on average$"
     )
-    with pytest.warns(RuntimeWarning, match=rule) as caught:
-        refiner, result = refined(first)
-    assert len(caught) == 1
-    np.testing.assert_array_equal(result, expected)
+    with pytest.warns(RuntimeWarning, match=rule) as messages:
+        refiner, actual = refined(first)
+    assert len(messages) == 1
+    np.testing.assert_array_equal(actual, expected)
     assert refiner.fingerprint.endswith(f"-{second}-fp32")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -110,8 +110,8 @@ def test_a_wrong_precision_gives_way_to_fp32_of_the_same_runtime(broken):
     with pytest.warns(
         RuntimeWarning, match="is run by openvino in fp32, since on this machine openvino in bf16 is off"
     ):
-        refiner, result = refined("openvino", precision="bf16")
-    np.testing.assert_array_equal(result, expected)
+        refiner, actual = refined("openvino", precision="bf16")
+    np.testing.assert_array_equal(actual, expected)
     assert refiner.fingerprint.endswith("-openvino-fp32")
 
 

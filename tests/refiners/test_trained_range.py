@@ -23,12 +23,12 @@ OFFSETS = (0, 60, 120, 200)
 
 
 class Keeper:
-    """A refiner that records its input."""
+    """A refiner that keeps what it is given."""
 
     needs_confidence = needs_candidates = True
 
     def __call__(self, coarse, left, *, threads=1):
-        self.inputs = coarse, left.copy()
+        self.arguments = coarse, left.copy()
         return stereokit.REFINERS.get("linear")()(coarse, left, threads=threads)
 
 
@@ -40,7 +40,7 @@ def coarse_maps():
     truth = 6 + 30 * (y / HEIGHT) ** 2 + 8 * ((x > 300) & (x < 380) & (y > 40)).astype(np.float32)
     coarse = np.kron(rng.normal(size=(HEIGHT // 4, WIDTH // 4 + 100)), np.ones((4, 4))) * 40
     texture = cv2.GaussianBlur(coarse + rng.normal(size=coarse.shape) * 30, (0, 0), 0.9).astype(np.float32) + 120
-    maps = {}
+    actual = {}
     for offset in OFFSETS:
         # The left view stays, the right one shows what lies further to the right.
         views = (
@@ -51,8 +51,8 @@ def coarse_maps():
         keeper = Keeper()
         matcher = Matcher("S4", max_disparity=256, scale=0.5, refiner=keeper)
         matcher(*(np.clip(np.rint(view), 0, 255).astype(np.uint8) for view in noisy))
-        maps[offset] = keeper.inputs
-    return truth, maps
+        actual[offset] = keeper.arguments
+    return truth, actual
 
 
 @pytest.mark.parametrize("name", ["linear", *NAMES])
@@ -134,8 +134,8 @@ def test_disparities_beyond_the_training_are_warned_of_once():
     left = image_of((64, 96))
     refiner = LearnedRefiner.of(content, precision="fp32")
     assert refiner.trained_disparities == (0, 128)
-    lines = messages(lambda: refiner(sure(ramp), left))
-    assert len(lines) == 1 and "128 px" in lines[0] and "linear" in lines[0] and "\n" not in lines[0]
+    notices = messages(lambda: refiner(sure(ramp), left))
+    assert len(notices) == 1 and "128 px" in notices[0] and "linear" in notices[0] and "\n" not in notices[0]
     assert messages(lambda: refiner(sure(ramp), left)) == []  # once is enough
     wider = dataclasses.replace(content, notes={"disparities": [0, 256]})
     refiner = LearnedRefiner.of(wider, precision="fp32")

@@ -25,7 +25,7 @@ __all__ = ["train"]
 
 def train(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the result; created if missing.")],
-    refiner: Annotated[str, typer.Option(help="Architecture: stereovae, cnn or pyramid.")] = "stereovae",
+    refiner: Annotated[str, typer.Option(help="stereokit (general), stereovae, cnn or pyramid.")] = "stereovae",
     dataset: Annotated[str | None, typer.Option(help=f"One of {', '.join(DATASETS)}.")] = None,
     root: Annotated[Path | None, typer.Option(help="Folder of the data set.")] = None,
     frames: Annotated[str | None, typer.Option(help="Frames to train on, such as 13-33,46.")] = None,
@@ -36,7 +36,8 @@ def train(
     ] = None,
     extra_share: Annotated[float, typer.Option(help="Share of the crops that are of extra frames.")] = 0.2,
     streets: Annotated[int, typer.Option(help="Synthetic streets to train on.")] = 0,
-    street_share: Annotated[float, typer.Option(help="Share of the crops that are of streets.")] = 0.5,
+    generated: Annotated[int, typer.Option(help="Generated pairs of all kinds to train on.")] = 0,
+    street_share: Annotated[float, typer.Option(help="Share of the crops of streets and generated pairs.")] = 0.5,
     method: Annotated[list[str] | None, typer.Option(help="Matchers; may repeat. Default S1 to S4.")] = None,
     variants: Annotated[int, typer.Option(help="Variants of each frame and matcher.")] = 9,
     start: Annotated[Path | None, typer.Option(help="Weights to begin with.")] = None,
@@ -51,8 +52,9 @@ def train(
     matchers = {"method": method} if method else {}
     document = run_training(
         output, refiner, dataset=dataset, root=root, frames=frames, validation=validation, folds=folds,
-        extra=extra or (), extra_share=extra_share, streets=streets, street_share=street_share, variants=variants,
-        start=start, preset=preset, settings=settings or (), max_disparity=max_disparity, cache=cache, **matchers,
+        extra=extra or (), extra_share=extra_share, streets=streets, generated=generated,
+        street_share=street_share, variants=variants, start=start, preset=preset, settings=settings or (),
+        max_disparity=max_disparity, cache=cache, **matchers,
     )  # fmt: skip
     if document.pop("rank") == 0 and not write_json(json_file, document):
         _print(document)
@@ -65,7 +67,8 @@ def _print(document: dict[str, Any]) -> None:
     for name, value in document["pooled"].items():
         table.add_row(name, "-" if value is None else f"{value:.2f}")
     console = Console()
-    console.print(table)
+    if document["pooled"]:
+        console.print(table)
     for result in document["results"]:
         console.print(
             f"wrote {json.dumps(result['folder'])[1:-1]}/weights.safetensors", highlight=False, soft_wrap=True

@@ -8,6 +8,7 @@ out once.
 from __future__ import annotations
 
 import io
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
@@ -16,11 +17,13 @@ from typing import Any
 
 from stereokit.cli.options import parse_settings
 from stereokit.errors import InputError, OptionError, StereokitError
+from stereokit.images.check import check_integer
 from stereokit.io import make_folder, write_bytes
 from stereokit.methods import check_levels, parse_method
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data.datasets import load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.training.generated import GENERAL, generated_pairs, levels_for, train_general
 from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of, scene_pair
 
 __all__ = ["run_training"]
@@ -31,9 +34,9 @@ _MATCHERS = ("S1", "S2", "S3", "S4")
 def run_training(
     output: Path, refiner: str = "stereovae", *, dataset: str | None = None, root: Path | None = None,
     frames: str | None = None, validation: str | None = None, folds: str | None = None, extra: Sequence[str] = (),
-    extra_share: float = 0.2, streets: int = 0, street_share: float = 0.5, method: Sequence[str] = _MATCHERS,
-    variants: int = 9, start: Path | None = None, preset: str = "default", settings: Sequence[str] = (),
-    max_disparity: int = 128, cache: Path | None = None,
+    extra_share: float = 0.2, streets: int = 0, generated: int = 0, street_share: float = 0.5,
+    method: Sequence[str] = _MATCHERS, variants: int = 9, start: Path | None = None, preset: str = "default",
+    settings: Sequence[str] = (), max_disparity: int = 128, cache: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Train a refiner; after a kill, the same call resumes from the checkpoint.
 
@@ -42,7 +45,7 @@ def run_training(
     output : Path
         Folder of the result; created if missing.
     refiner : str
-        Architecture, one of `stereokit_refiners.weights.NETWORKS`.
+        Architecture, one of `stereokit_refiners.weights.NETWORKS`, or ``"stereokit"``.
     dataset, root : str, Path, optional
         A data set and its folder.
     frames, validation, folds : str, optional
@@ -51,6 +54,9 @@ def run_training(
         More frames to train on, ``DATASET:ROOT``, never held out; `extra_share` of the crops.
     streets : int
         Synthetic streets to train on; `street_share` of the crops.
+    generated : int
+        Generated pairs of all kinds to train on, as streets are; the general refiner (``"stereokit"``) trains on these
+        alone.
     method : sequence of str
         Matchers whose maps are trained on.
     variants : int
@@ -75,6 +81,15 @@ def run_training(
         If an option breaks its rule, frames have no ground truth, files cannot be used, or torch is not installed.
     """
     torch = _torch()
+    check_integer("generated", generated, 0)
+    if refiner in GENERAL:
+        others: dict[str, Any] = {"dataset": dataset, "streets": streets, "extra": extra, "folds": folds}
+        others |= {"frames": frames, "validation": validation}
+        for name in (name for name, value in others.items() if value):
+            raise OptionError(f"refiner {refiner!r} trains on generated pairs alone, got {name} too")
+        if generated < 1:
+            raise OptionError(f"generated must be at least 1 for refiner {refiner!r}, got {generated}")
+        return train_general(output, generated, start=start, settings=settings, cache=cache)
     from stereokit_refiners.networks.layers import output_rule
     from stereokit_refiners.training.loop import Source
     from stereokit_refiners.training.samples import SampleFiles, store_variant
@@ -83,8 +98,8 @@ def run_training(
     training_settings = _training_settings(preset, settings)
     if refiner not in NETWORKS:
         raise OptionError(f"refiner to train must be one of {', '.join(NETWORKS)}, got {refiner!r}")
-    if dataset is None and streets < 1 and not extra:
-        raise OptionError("dataset, extra or streets must be set, got none of them")
+    if dataset is None and streets < 1 and generated < 1 and not extra:
+        raise OptionError("dataset, extra, streets or generated must be set, got none of them")
     if folds is not None and (dataset is None or validation is not None):
         raise OptionError(f"folds must come with a dataset and without validation, got {folds!r}")
     if not (0 <= extra_share and 0 <= street_share and extra_share + street_share <= 1) or streets < 0 or variants < 1:
@@ -136,13 +151,23 @@ def run_training(
                 step(pair.name)
         return paths
 
+    def stored_pairs(step: Callable[..., None]) -> list[Path]:
+        paths = []
+        for pair in generated_pairs(generated, cache_folder / "pairs"):
+            levels = max(max_disparity, levels_for(pair))
+            for n, name in itertools.product((0, 1), methods):
+                paths.append(store_variant(pair, name, training_settings.seed, n, levels, cache_folder))
+                step(f"{pair.name} {name}")
+        return paths
+
     training_frames = {frame.name: frame for training, _ in groups for frame in training} | extra_frames
     test_frames = {frame.name: frame for _, held_out in groups for frame in held_out}
     total = (len(training_frames) * variants + len(test_frames)) * len(methods) + 2 * streets
+    total += 2 * generated * len(methods)
     with progress(total) as (_, step):
         maps = {name: stored(frame, range(variants), step) for name, frame in training_frames.items()}
         held_out_maps = {name: stored(frame, range(1), step) for name, frame in test_frames.items()}
-        scenes = stored_streets(step)
+        scenes = [*stored_streets(step), *stored_pairs(step)]
     results = []
     for number, (training, held_out) in enumerate(groups):
         own_maps = [path for frame in training for path in maps[frame.name]]
@@ -170,6 +195,7 @@ def run_training(
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})
     return {
         "refiner": refiner, "settings": asdict(training_settings), "methods": methods, "streets": streets,
+        "generated": generated,
         "frames": sorted(training_frames), "results": results, "pooled": _pooled(results, methods), "rank": world[0],
     }  # fmt: skip
 

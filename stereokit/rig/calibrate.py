@@ -459,9 +459,16 @@ def rectified_pixels(rig: StereoRig, rectified: Rectification, side: int, pixels
         flat = cv2.fisheye.undistortPoints(points, camera.matrix, camera.distortion, R=turn, P=projection)
     else:
         distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-        flat = cv2.undistortPoints(points, camera.matrix, distortion, None, turn, projection, criteria)
+        flat = _undistorted(points, camera.matrix, distortion, turn, projection)
     return np.asarray(flat, np.float64).reshape(-1, 2)
+
+
+def _undistorted(points: Array, camera: Array, distortion: Array, turn: Array, projection: Array) -> Any:
+    """Return points without distortion, with as many iterations as it takes: five are too few at the sides."""
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+        return cv2.undistortPointsIter(points, camera, distortion, turn, projection, criteria)
+    return cv2.undistortPoints(points, camera, distortion, None, turn, projection, criteria)
 
 
 def _coverage(pixels: Sequence[Array], size: tuple[int, int]) -> float:
@@ -492,7 +499,8 @@ def directions(camera: Camera, pixels: Array) -> Array:
     if camera.model == "fisheye":
         flat = cv2.fisheye.undistortPoints(points, camera.matrix, camera.distortion)
     else:
-        flat = cv2.undistortPoints(points, camera.matrix, camera.distortion if len(camera.distortion) else np.zeros(5))
+        distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
+        flat = _undistorted(points, camera.matrix, distortion, np.eye(3), np.eye(3))
     return np.asarray(flat, np.float64).reshape(-1, 2)
 
 

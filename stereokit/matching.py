@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["METHODS", "Matcher", "match", "warmup"]
+__all__ = ["METHODS", "Matcher", "compile_kernels", "match", "warmup"]
 
 
 class Matcher:
@@ -476,10 +476,25 @@ def warmup(*methods: str, max_disparity: int = 128, **options: Unpack[WarmupOpti
         If an option cannot be used.
     """
     values: dict[str, Any] = {**options, "max_disparity": max_disparity}
-    image = np.arange(64 * 64, dtype=np.uint16).astype(np.uint8).reshape(64, 64)
     for method in methods or METHODS:
-        with collecting():
-            Matcher(method, **values)(image, image)
+        compile_kernels(Matcher(method, **values))
+
+
+def compile_kernels(matcher: Matcher, shape: tuple[int, ...] = (), dtype: Any = np.uint8) -> None:
+    """Compile what a matcher needs for images of a type, so that a time taken afterwards is that of matching.
+
+    Parameters
+    ----------
+    matcher : Matcher
+    shape : tuple of int
+        ``()`` for grey images, ``(3,)`` or ``(4,)`` for colour.
+    dtype : numpy type
+    """
+    side = 320  # speckles are a share of the pixels: at a quarter of the size there must be some to remove
+    image = np.zeros((side, side, *shape), dtype)
+    image[:, ::2] = 1
+    with collecting():
+        matcher(image, image)
 
 
 def _forget_matchers() -> None:

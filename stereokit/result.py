@@ -125,7 +125,7 @@ class Disparity:
         OptionError
             If `max_depth` is not positive.
         """
-        return calibration.disparity_to_depth(self._kept(calibration, filled, max_depth))
+        return calibration.disparity_to_depth(self._depth_disparity(calibration, filled, max_depth))
 
     def points(
         self, calibration: Calibration, *, filled: bool = False, max_depth: float | None = None, frame: str = "optical"
@@ -147,9 +147,9 @@ class Disparity:
         OptionError
             If `max_depth` is not positive, or there is no such frame.
         """
-        return calibration.points(self._kept(calibration, filled, max_depth), frame)
+        return calibration.points(self._depth_disparity(calibration, filled, max_depth), frame)
 
-    def _kept(self, calibration: Calibration, filled: bool, max_depth: float | None) -> NDArray[np.float32]:
+    def _depth_disparity(self, calibration: Calibration, filled: bool, max_depth: float | None) -> NDArray[np.float32]:
         """Return the map of the pixels that have a depth for the user."""
         disparity = self.disparity if check_flag("filled", filled) else self.measured
         if max_depth is None:

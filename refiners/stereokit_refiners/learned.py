@@ -359,7 +359,7 @@ def _backend(name: str) -> str:
             )
         return installed[0]
     if name not in installed:
-        way = {"openvino": "'stereokit[fast]'", "onnxruntime": "'stereokit[onnx]'", "torch": "'stereokit[train]'"}
+        way = {"openvino": "'stereokit[refiners]'", "onnxruntime": "'stereokit[onnx]'", "torch": "'stereokit[train]'"}
         raise StereokitError(
             f"backend {name!r} is not installed: pip install {way.get(name, 'opencv-python-headless')}"
         )

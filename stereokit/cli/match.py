@@ -40,7 +40,6 @@ from stereokit.cli.pair import (
 )
 from stereokit.cli.rig import AlphaOption, RigOption, read_rig_option
 from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
-from stereokit.notices import collecting
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -112,8 +111,6 @@ def match(
     images (.npy, .tiff or any other) are matched in windows, and the map goes to .npy or tiled .tiff as it grows.
     With --rig the images are raw ones: they are rectified first, and the map is that of the rectified left view.
     """
-    import numpy as np
-
     from stereokit import io
 
     suffixes = {
@@ -179,7 +176,7 @@ def match(
         report({**content, "options": options, "version": version_of("stereokit")}, [table], json_file)
         return
 
-    from stereokit.matching import Matcher
+    from stereokit.matching import Matcher, compile_kernels
 
     matcher = Matcher(method, **matcher_options, **options)
     images = io.read_views(left, layout) if right_image is None else io.read_pair(left, right_image, alpha=True)
@@ -201,9 +198,7 @@ def match(
         images = images[0], aligned(*images, nodata)
 
     with waiting("Matching (the first run also compiles) ..."):
-        blanks = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
-        with collecting():
-            matcher(*blanks)  # compiles, so that the time below is that of matching
+        compile_kernels(matcher, images[0].shape[2:], images[0].dtype)
         with strictly(strict):
             start = time.perf_counter()
             result = matcher(*images, **masks)

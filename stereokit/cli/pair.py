@@ -103,26 +103,26 @@ def check(
 
     check_json(json_file)
     images = io.read_pair(left, right, alpha=True)
-    found = check_pair(*images, max_disparity=max_disparity, min_disparity=min_disparity, nodata=nodata)
-    values = {name: getattr(found, name) for name in found.__dataclass_fields__ if name != "faults"}
-    faults = [{"kind": fault.kind, "message": fault.message, "serious": fault.serious} for fault in found.faults]
+    quality = check_pair(*images, max_disparity=max_disparity, min_disparity=min_disparity, nodata=nodata)
+    values = {name: getattr(quality, name) for name in quality.__dataclass_fields__ if name != "faults"}
+    faults = [{"kind": fault.kind, "message": fault.message, "serious": fault.serious} for fault in quality.faults]
     content = {"left": str(left), "right": str(right), **values, "faults": faults, "version": version_of("stereokit")}
     table = Table("Common points", "Agree", "Row offset", "Roll", "Height", "Disparities", "Brightness", "Sharpness")
     unknown = "unknown"
     table.add_row(
-        str(found.points),
-        f"{100 * found.agreement:.0f} %",
-        unknown if found.row_offset is None else f"{found.row_offset:+.2f} px",
-        unknown if found.roll is None else f"{found.roll:+.3f} degrees",
-        unknown if found.scale is None else f"x {found.scale:.4f}",
-        unknown if found.disparities is None else "{:.1f} .. {:.1f}".format(*found.disparities),
-        f"x {found.brightness:.2f}",
-        f"x {found.sharpness:.2f}",
+        str(quality.points),
+        f"{100 * quality.agreement:.0f} %",
+        unknown if quality.row_offset is None else f"{quality.row_offset:+.2f} px",
+        unknown if quality.roll is None else f"{quality.roll:+.3f} degrees",
+        unknown if quality.scale is None else f"x {quality.scale:.4f}",
+        unknown if quality.disparities is None else "{:.1f} .. {:.1f}".format(*quality.disparities),
+        f"x {quality.brightness:.2f}",
+        f"x {quality.sharpness:.2f}",
     )
     report(content, [table], json_file)
-    for fault in found.faults:
+    for fault in quality.faults:
         typer.echo(f"{'fault' if fault.serious else 'note'}: {fault.message}", err=True)
-    if not found.faults and found.row_offset is None:
+    if not quality.faults and quality.row_offset is None:
         typer.echo("note: too few points are seen by both views to tell how their rows lie", err=True)
-    if any(fault.serious for fault in found.faults):
+    if any(fault.serious for fault in quality.faults):
         raise typer.Exit(1)

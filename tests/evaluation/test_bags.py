@@ -162,13 +162,13 @@ def test_big_endian_bayer_yuv_and_compressed(tmp_path):
         "yuv": messages.image(START, packed.tobytes(), "yuv422_yuy2", 8, 6, 16),
         "png": messages.compressed(START, flat[:, :, ::-1]),
     }
-    found = {}
+    frames = {}
     for name, message in rows.items():
-        (found[name],) = Bag(written(tmp_path / name, messages, [(t, START, message) for t in (LEFT, RIGHT)])).frames()
-    assert np.array_equal(found["big"].left, deep)
-    assert np.array_equal(found["png"].right, flat)
-    assert np.abs(found["bayer"].left[2:4, 2:6].astype(int) - flat[2:4, 2:6]).max() <= 1
-    assert np.abs(found["yuv"].left.astype(int) - flat).max() <= 3
+        (frames[name],) = Bag(written(tmp_path / name, messages, [(t, START, message) for t in (LEFT, RIGHT)])).frames()
+    assert np.array_equal(frames["big"].left, deep)
+    assert np.array_equal(frames["png"].right, flat)
+    assert np.abs(frames["bayer"].left[2:4, 2:6].astype(int) - flat[2:4, 2:6]).max() <= 1
+    assert np.abs(frames["yuv"].left.astype(int) - flat).max() <= 3
 
 
 def test_frames_that_cannot_be_decoded_cost_nobody_else(tmp_path):

@@ -99,13 +99,13 @@ def test_a_bag_becomes_maps_and_a_bag(tmp_path):
         content.append(("/stereo/left/camera_info", stamp, messages.info(stamp, P, size)))
         content.append(("/stereo/right/camera_info", stamp, messages.info(stamp, Q, size)))
     bag = written(tmp_path / "run", messages, content)
-    output, made = tmp_path / "out", tmp_path / "depth"
+    output, depth_bag = tmp_path / "out", tmp_path / "depth"
     common = ["batch", bag, "-o", output, "--format", "pfm", "--max-disparity", 16]
-    code, text = run(*common, "--topics", f"{LEFT},{RIGHT}", "--bag", made)
+    code, text = run(*common, "--topics", f"{LEFT},{RIGHT}", "--bag", depth_bag)
     assert code == 0, text
     names = [str(START + 100 * MS * number) for number in range(3)]
     check_maps(output, names)
-    with AnyReader([made]) as reader:
+    with AnyReader([depth_bag]) as reader:
         depths = [
             (time, reader.deserialize(data, connection.msgtype).data.view("<f4"))
             for connection, time, data in reader.messages()
@@ -115,7 +115,7 @@ def test_a_bag_becomes_maps_and_a_bag(tmp_path):
     assert abs(np.nanmedian(depths[0][1]) - 100 * 0.12 / (SHIFT + 2)) < 0.05
     for more, line in (
         (["--topics", "/a,/b"], "no image topic '/a'"),
-        (["--bag", made], "--bag must not exist"),
+        (["--bag", depth_bag], "--bag must not exist"),
         (["--layout", "pages"], "not for ROS bags"),
     ):
         code, text = run(*common, *more)

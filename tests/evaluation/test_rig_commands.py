@@ -46,11 +46,13 @@ def scene(tmp_path_factory):
 
 
 def depth_error(path, rig, **options):
-    made = rig.rectification(**options)
-    camera = made.calibration
+    rectification = rig.rectification(**options)
+    camera = rectification.calibration
     depth = camera.disparity_to_depth(io.read_disparity(path))
-    expected = rigs.true_depth(made.turns[0], (camera.fx, camera.fy, camera.cx0, camera.cy), made.size)
-    known = made.mask & np.isfinite(depth) & np.isfinite(expected)
+    expected = rigs.true_depth(
+        rectification.turns[0], (camera.fx, camera.fy, camera.cx0, camera.cy), rectification.size
+    )
+    known = rectification.mask & np.isfinite(depth) & np.isfinite(expected)
     assert known.mean() > 0.5
     return float(np.median(np.abs(depth[known] / expected[known] - 1)))
 
@@ -104,19 +106,21 @@ def test_what_match_refuses(scene, tmp_path, words, line):
 
 def test_rectify_a_folder_and_match_what_comes_of_it(scene, tmp_path):
     folder, rig, images = scene
-    made = tmp_path / "rectified"
-    output = run("rectify", folder / "raw", "-o", made, "--rig", folder / "rig.yml", "--json", tmp_path / "j.json")
+    output_folder = tmp_path / "rectified"
+    output = run(
+        "rectify", folder / "raw", "-o", output_folder, "--rig", folder / "rig.yml", "--json", tmp_path / "j.json"
+    )
     assert "2 pairs in " in output and json.loads((tmp_path / "j.json").read_text())["written"] == 2
     left, right = rig.rectify(*images)
-    np.testing.assert_array_equal(io.read_image(made / "left/01.png"), left)
-    np.testing.assert_array_equal(io.read_image(made / "right/02.png"), right)
-    assert read_calibration(made / "calibration.json", size=rigs.SIZE) == rig.rectified()
-    np.testing.assert_array_equal(io.read_image(made / "mask.png") > 0, rig.rectification().mask)
-    assert io.read_image(made / "rows.png").shape == (HEIGHT, 2 * WIDTH, 3)
+    np.testing.assert_array_equal(io.read_image(output_folder / "left/01.png"), left)
+    np.testing.assert_array_equal(io.read_image(output_folder / "right/02.png"), right)
+    assert read_calibration(output_folder / "calibration.json", size=rigs.SIZE) == rig.rectified()
+    np.testing.assert_array_equal(io.read_image(output_folder / "mask.png") > 0, rig.rectification().mask)
+    assert io.read_image(output_folder / "rows.png").shape == (HEIGHT, 2 * WIDTH, 3)
     run(
         "match",
-        made / "left/01.png",
-        made / "right/01.png",
+        output_folder / "left/01.png",
+        output_folder / "right/01.png",
         "-o",
         tmp_path / "d.pfm",
         "--max-disparity",
@@ -132,15 +136,36 @@ def test_rectify_two_images_with_options(scene, tmp_path):
     raw = folder / "raw/left01.png", folder / "raw/right01.png"
     words = ("--rig", folder / "rig.yml", "--alpha", 1, "--size", "400x300", "--crop", "--format", "tiff")
     assert "1 pairs in" in run("rectify", *raw, "-o", tmp_path / "out", *words)
-    made = rig.rectification(alpha=1.0, size=(400, 300), crop=True)
+    rectification = rig.rectification(alpha=1.0, size=(400, 300), crop=True)
     image = io.read_image(tmp_path / "out/left/left01.tiff")
-    assert image.shape[1::-1] == made.size
-    assert read_calibration(tmp_path / "out/calibration.json") == made.calibration
+    assert image.shape[1::-1] == rectification.size
+    assert read_calibration(tmp_path / "out/calibration.json") == rectification.calibration
     for wrong, line in (("400", "--size must be WIDTHxHEIGHT, such as 1280x720, got '400'"), ("0x3", "--size must be")):
         assert line in run(
             "rectify", *raw, "-o", tmp_path / "no", "--rig", folder / "rig.yml", "--size", wrong, status=2
         )
     assert not (tmp_path / "no").exists()
+
+
+def test_a_rig_in_two_files_or_in_a_folder(scene, tmp_path):
+    folder, rig, images = scene
+    place = tmp_path / "rig"
+    place.mkdir()
+    for name, entries in (
+        (
+            "intrinsics.yml",
+            {"M1": rig.left.matrix, "D1": rig.left.distortion, "M2": rig.right.matrix, "D2": rig.right.distortion},
+        ),
+        ("extrinsics.yml", {"R": rig.rotation, "T": rig.translation_m}),
+    ):
+        file = cv2.FileStorage(str(place / name), cv2.FILE_STORAGE_WRITE)
+        for key, value in entries.items():
+            file.write(key, np.atleast_2d(value))
+        file.release()
+    raw = folder / "raw/left01.png", folder / "raw/right01.png"
+    for words in (place, f"{place / 'intrinsics.yml'},{place / 'extrinsics.yml'}"):
+        run("rectify", *raw, "-o", tmp_path / "out", "--rig", words)
+        np.testing.assert_array_equal(io.read_image(tmp_path / "out/left/left01.png"), rig.rectify(*images)[0])
 
 
 def test_rectify_names_pairs_that_fail(scene, tmp_path):
@@ -268,3 +293,30 @@ def test_calibrate_a_folder(tmp_path):
 def test_what_calibrate_refuses(scene, tmp_path, words, line):
     output = run("calibrate", scene[0] / "raw", "-o", tmp_path / "rig.yml", *words, status=2)
     assert line in output and not (tmp_path / "rig.yml").exists()
+
+
+def test_live_rectifies_raw_frames_first(scene):
+    """The engine matches what the rig rectifies, leaves out what no sensor saw, and has the rectified depth."""
+    pytest.importorskip("aiohttp")
+    from stereokit import Matcher
+    from stereokit_evaluation.live.engine import Engine
+    from stereokit_evaluation.live.source import Folder
+
+    folder, _, images = scene
+    sizes = []
+
+    def rectify(size):
+        sizes.append(size)
+        return read_rig(folder / "rig.yml", size=size).rectification()
+
+    engine = Engine(Folder(folder / "raw", rate=200), rectify=rectify, max_disparity=64)
+    engine.start()
+    engine.thread.join()
+    rectification = read_rig(folder / "rig.yml").rectification()
+    expected = Matcher(max_disparity=64, confidence=True)(*rectification(*images), **rectification.masks)
+    assert sizes == [(WIDTH, HEIGHT)]  # one rectification for all frames
+    assert np.array_equal(engine.view.result.disparity, expected.disparity, equal_nan=True)
+    assert np.array_equal(engine.view.result.valid, expected.valid)
+    assert engine.calibration == rectification.calibration
+    x, y = WIDTH // 2, HEIGHT // 2
+    assert engine.at(x, y)["depth"] == pytest.approx(expected.depth(rectification.calibration)[y, x], rel=1e-5)

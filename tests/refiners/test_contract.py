@@ -311,7 +311,7 @@ def test_a_runtime_that_is_not_there_is_named(monkeypatch):
     real = importlib.util.find_spec
     gone = {"openvino", "onnxruntime", "torch"}
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n in gone else real(n, *a))
-    for backend, extra in {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}.items():
+    for backend, extra in {"openvino": "refiners", "onnxruntime": "onnx", "torch": "train"}.items():
         with pytest.raises(StereokitError, match=rf"^backend '{backend}' is not installed: .*stereokit\[{extra}\]'$"):
             LearnedRefiner.of(random_content("cnn"), backend=backend)
     assert LearnedRefiner.of(random_content("cnn")).backend == "opencv"

@@ -73,9 +73,9 @@ def test_every_kind_of_value_is_written_as_onnx_reads_it():
         np.testing.assert_array_equal(onnx.numpy_helper.to_array(tensor), arrays[tensor.name])
     (read,) = model.graph.node
     assert (read.op_type, list(read.input), list(read.output)) == ("Op", ["a", ""], ["b"])
-    found = {a.name: onnx.helper.get_attribute_value(a) for a in read.attribute}
-    assert found["whole"] == -3 and found["float"] == pytest.approx(0.1) and found["text"] == b"linear"
-    assert list(found["wholes"]) == [0, 127, 128, -1] and list(found["none"]) == []
+    values = {a.name: onnx.helper.get_attribute_value(a) for a in read.attribute}
+    assert values["whole"] == -3 and values["float"] == pytest.approx(0.1) and values["text"] == b"linear"
+    assert list(values["wholes"]) == [0, 127, 128, -1] and list(values["none"]) == []
     dims = model.graph.input[0].type.tensor_type.shape.dim
     assert [d.WhichOneof("value") for d in dims] == ["dim_value", "dim_param", None] and dims[1].dim_param == "h"
     assert model.graph.output[0].type.tensor_type.shape.dim[0].dim_value == 300
@@ -104,17 +104,17 @@ def test_calls_side_by_side_give_the_same_bits_and_leave_the_threads_alone():
     refiner = LearnedRefiner.of(random_content("pyramid", last=0.5), backend="opencv")
     cases = [(coarse_of(size, seed), image_of(size, seed)) for seed in range(4)]
     expected = [refiner(*case).disparity for case in cases]
-    found: list[object] = [None] * len(cases)
+    maps_by_case: list[object] = [None] * len(cases)
 
     def work(k):
-        found[k] = [refiner(*cases[k], threads=1 + k % 2).disparity for _ in range(3)]
+        maps_by_case[k] = [refiner(*cases[k], threads=1 + k % 2).disparity for _ in range(3)]
 
     workers = [threading.Thread(target=work, args=(k,)) for k in range(len(cases))]
     for worker in workers:
         worker.start()
     for worker in workers:
         worker.join()
-    for maps, one in zip(found, expected, strict=True):
+    for maps, one in zip(maps_by_case, expected, strict=True):
         for other in maps:
             np.testing.assert_array_equal(other, one)
     assert cv2.getNumThreads() == before

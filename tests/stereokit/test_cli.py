@@ -58,7 +58,7 @@ def matching(monkeypatch):
     module.Matcher = FakeMatcher
     module.METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+sgm"}
     monkeypatch.setitem(sys.modules, "stereokit.matching", module)
-    monkeypatch.setattr(FakeMatcher, "made", [])
+    monkeypatch.setattr(FakeMatcher, "instances", [])
     for name, value in (("called", 0), ("confident", True), ("raises", None)):
         monkeypatch.setattr(FakeMatcher, name, value)
 

@@ -166,18 +166,18 @@ def test_depth_and_points_on_the_command_line(pair):
 def test_bad_options_are_one_line(pair, words, message):
     write_image(pair / "small.png", np.ones((2, 3), np.uint8))
     (pair / "broken.png").write_bytes(b"x")
-    found = run(pair, *(word.format(pair) for word in words))
-    assert found.exit_code == 2 and message in " ".join(found.output.split()).replace("│ ", "")
+    outcome = run(pair, *(word.format(pair) for word in words))
+    assert outcome.exit_code == 2 and message in " ".join(outcome.output.split()).replace("│ ", "")
 
 
 def test_masks_on_the_command_line(pair):
     assert run(pair, "--mask", pair / "mask.png").exit_code == 0
-    found = stereokit.read_disparity(pair / "d.pfm")
-    assert np.isnan(found[:, :50]).all() and np.isfinite(found[:, 50:]).all()
+    disparity = stereokit.read_disparity(pair / "d.pfm")
+    assert np.isnan(disparity[:, :50]).all() and np.isfinite(disparity[:, 50:]).all()
     words = (pair / "left.png", pair / "right.png", "-o", pair / "d.npy", "--max-disparity", 16)
     large = CliRunner().invoke(
         app, [str(word) for word in ("match", *words, "--memory", "4GB", "--mask", pair / "mask.png")]
     )
     assert large.exit_code == 0, large.output
-    np.testing.assert_array_equal(np.load(pair / "d.npy"), found)
+    np.testing.assert_array_equal(np.load(pair / "d.npy"), disparity)
     assert run(pair, "--nodata", 3).exit_code == 0

@@ -317,7 +317,7 @@ def test_others_may_write_while_a_decoder_is_silenced(capfd, nobody_else):
     with quiet.quiet_decoders(), quiet.quiet_decoders():
         os.write(2, b"not heard\n")
     assert capfd.readouterr().err == "heard\n"
-    assert cv2.utils.logging.getLogLevel() != cv2.utils.logging.LOG_LEVEL_SILENT
+    assert quiet._log.getLogLevel() != quiet._SILENT
 
 
 def test_the_command_line_says_one_line_for_each_broken_file(tmp_path, run_python):

@@ -419,6 +419,13 @@ def test_kitti_with_its_raw_cameras(tmp_path):
     rig = read_rig(path)
     check(rig, atol=1e-12)
     assert rig.rectified().fx == pytest.approx(rectified["P1"][0, 0])
+    text = path.read_text()
+    path.write_text(
+        text.replace("S_rect_02: 6.400000000000000e+02 4.800000000000000e+02", "S_rect_02: 6.2e+02 4.6e+02")
+    )
+    assert path.read_text() != text and read_rig(path).rectification().size == (620, 460)
+    with pytest.raises(InputError, match="got 620x460, and those are rectified ones: nothing is left to rectify"):
+        read_rig(path, size=(620, 460))
 
 
 RECTIFIED = {

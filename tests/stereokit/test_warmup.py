@@ -31,7 +31,7 @@ def test_a_later_match_compiles_nothing(tmp_path):
     assert re.fullmatch(r"S2: \d+\.\d s", line)
     compiled = {path: path.stat().st_mtime_ns for path in cache.rglob("*.nb?")}
     assert len(compiled) > 5
-    image = np.random.default_rng(0).integers(0, 256, (41, 77), np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (123, 177), np.uint8)  # large enough for speckles
     for name in ("left.png", "right.png"):
         cv2.imwrite(str(tmp_path / name), image)
     run(cache, "match", tmp_path / "left.png", tmp_path / "right.png", "-o", tmp_path / "m.pfm", "--max-disparity", 16)

@@ -127,15 +127,15 @@ class Bag(Frames):
         """
         if None in self._infos:
             return None
-        found: dict[str, Any] = {}
+        infos: dict[str, Any] = {}
         with parsing(self.path, "ROS bag"), _reader(self.path) as reader:
             for connection, _, data in reader.messages([c for c in reader.connections if c.topic in self._infos]):
-                found.setdefault(connection.topic, reader.deserialize(data, connection.msgtype))
-                if len(found) == len(set(self._infos)):
+                infos.setdefault(connection.topic, reader.deserialize(data, connection.msgtype))
+                if len(infos) == len(set(self._infos)):
                     break
-        if len(found) < 2:
+        if len(infos) < 2:
             return None
-        left, right = (found[str(topic)] for topic in self._infos)
+        left, right = (infos[str(topic)] for topic in self._infos)
         p, q = (
             np.asarray(info.p if hasattr(info, "p") else info.P, np.float64).reshape(3, 4) for info in (left, right)
         )

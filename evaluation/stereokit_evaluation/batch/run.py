@@ -13,13 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import stereokit
 from stereokit.errors import StereokitError
 from stereokit.io.calibrations.dispatch import digest
 from stereokit.kernels.threads import available_threads
-from stereokit.notices import collecting
+from stereokit.matching import compile_kernels
 from stereokit_evaluation.batch.job import Job, Outcome, matcher_of, work
 from stereokit_evaluation.batch.pairs import PairFiles
 from stereokit_evaluation.batch.store import finished, folder_identity, open_output
@@ -221,9 +219,7 @@ def on_threads(
 
 def _compile(job: Job) -> bool:
     """Match a small pair, so that threads do not compile side by side."""
-    small = np.zeros((32, 32), np.uint8)
-    with collecting():
-        matcher_of(job)(small, small)
+    compile_kernels(matcher_of(job))
     return True
 
 

@@ -25,7 +25,7 @@ from stereokit.io import write_image
 from stereokit_evaluation.common.folders import make_folder
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.common.weights import check_weights, weights_option
-from stereokit_evaluation.data.datasets import load_frames, select_frames
+from stereokit_evaluation.data.datasets import dataset_names, load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.error_map import error_map
 from stereokit_evaluation.scoring.runner import (
@@ -67,7 +67,7 @@ class _Run:
 
 
 def evaluate(
-    dataset: Annotated[str, typer.Option(help="kitti2015, kitti2012, middlebury, eth3d, folder or scenes.")],
+    dataset: Annotated[str, typer.Option(help=f"One of {', '.join(dataset_names())}.")],
     root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
     frames: Annotated[str | None, typer.Option(help="Numbers or names, such as 0-3,34-40.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,

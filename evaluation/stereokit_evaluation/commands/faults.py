@@ -121,7 +121,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     pairs = list(good_pairs(options.data))
     alarms: Counter[str] = Counter()
-    found: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     with options.output.open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["pair", "disturbance", "expected", "said", "warned"])
@@ -152,11 +152,11 @@ def main() -> None:
             name, left, right = pairs[k]
             for case in cases(left, right, pairs[(k + len(pairs) // 2) % len(pairs)][2]):
                 said, warned = look(name, case)
-                found[case.name][0] += bool(said & case.expected)
-                found[case.name][1] += 1
-                found[case.name][2] += warned > 0
-    print(f"{sum(total for _, total, _ in found.values())} disturbed pairs:")
-    for case_name, (detected, total, warned) in found.items():
+                counts[case.name][0] += bool(said & case.expected)
+                counts[case.name][1] += 1
+                counts[case.name][2] += warned > 0
+    print(f"{sum(total for _, total, _ in counts.values())} disturbed pairs:")
+    for case_name, (detected, total, warned) in counts.items():
         print(f"  {case_name:28s} {detected:3d} of {total:3d} {100 * detected / total:6.1f} %  warned of {warned}")
 
 

@@ -65,7 +65,7 @@ def settings(method: str, scale: float = 1) -> Iterator[dict[str, Any]]:
     yield base
     name = parse_method(method)
     cost, aggregation = name.split("+")
-    for group in (_COMMON, _STAGES[cost], _STAGES[aggregation], _STAGES.get(name, {})):
+    for group in (_COMMON, *(_STAGES.get(part, {}) for part in (cost, aggregation, name))):
         for option, values in group.items():
             for value in values:
                 yield {**base, option: value}

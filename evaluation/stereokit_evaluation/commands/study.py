@@ -23,7 +23,7 @@ from stereokit_evaluation.bench.baselines import HH, THREE_WAY, opencv_threads
 from stereokit_evaluation.bench.table import machine, system_load, versions
 from stereokit_evaluation.common.folders import check_folder, make_folder
 from stereokit_evaluation.common.progress import progress
-from stereokit_evaluation.data.datasets import load_frames, select_frames
+from stereokit_evaluation.data.datasets import dataset_names, load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.data.published import PAPER
 from stereokit_evaluation.data.splits import comparison, count_frames, split
@@ -40,7 +40,7 @@ _DEFAULT_DISPARITIES = 128
 
 
 def study(
-    dataset: Annotated[str, typer.Option(help="kitti2015, scenes, or another data set of evaluate.")] = "scenes",
+    dataset: Annotated[str, typer.Option(help=f"One of {', '.join(dataset_names())}.")] = "scenes",
     root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
     split_name: Annotated[
         str | None,

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from stereokit.cli.options import JsonOption, check_json, write_json
 from stereokit.cli.output import Table
+from stereokit_evaluation.data.datasets import DATASETS
 from stereokit_evaluation.training.run import run_training
 
 __all__ = ["train"]
@@ -25,7 +26,7 @@ __all__ = ["train"]
 def train(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the result; created if missing.")],
     refiner: Annotated[str, typer.Option(help="Architecture: stereovae, cnn or pyramid.")] = "stereovae",
-    dataset: Annotated[str | None, typer.Option(help="kitti2015, kitti2012, middlebury, folder ...")] = None,
+    dataset: Annotated[str | None, typer.Option(help=f"One of {', '.join(DATASETS)}.")] = None,
     root: Annotated[Path | None, typer.Option(help="Folder of the data set.")] = None,
     frames: Annotated[str | None, typer.Option(help="Frames to train on, such as 13-33,46.")] = None,
     validation: Annotated[str | None, typer.Option(help="Frames to validate on.")] = None,

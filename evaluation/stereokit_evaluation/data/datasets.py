@@ -25,6 +25,8 @@ from stereokit_evaluation.data.frame import Frame, Loader, select_frames
 __all__ = [
     "DATASETS",
     "Frame",
+    "data_set",
+    "dataset_names",
     "eth3d",
     "folder",
     "kitti2012",
@@ -42,6 +44,17 @@ _SCENE_SIZE = (640, 384)  # width, height
 _MAPS = (*DISPARITY_SUFFIXES, ".tif")
 
 
+DATASETS: dict[str, Callable[[str | Path], list[Frame]]] = {}
+"""The data sets that live in a folder, by the names that the command line uses."""
+
+
+def data_set(function: Callable[[str | Path], list[Frame]]) -> Callable[[str | Path], list[Frame]]:
+    """File a function among `DATASETS` under its own name."""
+    DATASETS[function.__name__] = function
+    return function
+
+
+@data_set
 def kitti2015(root: str | Path) -> list[Frame]:
     """Return the frames of KITTI 2015: ``image_2``, ``image_3``, ``disp_noc_0``, ``disp_occ_0``, ``obj_map``.
 
@@ -53,6 +66,7 @@ def kitti2015(root: str | Path) -> list[Frame]:
     return _kitti("KITTI 2015", root, [("image_2", "image_3")], ("disp_noc_0", "disp_occ_0", "obj_map"))
 
 
+@data_set
 def kitti2012(root: str | Path) -> list[Frame]:
     """Return the frames of KITTI 2012: ``image_0``, ``image_1``, ``disp_noc`` and ``disp_occ``.
 
@@ -66,6 +80,7 @@ def kitti2012(root: str | Path) -> list[Frame]:
     return _kitti("KITTI 2012", root, pairs, ("disp_noc", "disp_occ", "obj_map"))
 
 
+@data_set
 def middlebury(root: str | Path) -> list[Frame]:
     """Return the Middlebury pairs in any folder at or below `root`, named by their folder.
 
@@ -89,12 +104,14 @@ def middlebury(root: str | Path) -> list[Frame]:
     return _sorted_frames("Middlebury", frames, base, layouts)
 
 
+@data_set
 def eth3d(root: str | Path) -> list[Frame]:
     """Return the ETH3D pairs below `root`: ``im0.png``, ``im1.png``, ``disp0GT.pfm``, ``mask0nocc.png``."""
     base = _root(root)
     return _sorted_frames("ETH3D", [*_with_calibration(base)], base, "folders with im0.png, im1.png, disp0GT.pfm")
 
 
+@data_set
 def folder(root: str | Path) -> list[Frame]:
     """Return the pairs of a plain folder: ``left/NAME`` and ``right/NAME``, matched without extension.
 
@@ -149,14 +166,9 @@ def scenes(count: int = 20) -> list[Frame]:
     ]
 
 
-DATASETS: dict[str, Callable[[str | Path], list[Frame]]] = {
-    "kitti2015": kitti2015,
-    "kitti2012": kitti2012,
-    "middlebury": middlebury,
-    "eth3d": eth3d,
-    "folder": folder,
-}
-"""The data sets that live in a folder, by the names that the command line uses."""
+def dataset_names() -> list[str]:
+    """Return the names of all data sets, those of `DATASETS` and ``"scenes"``."""
+    return [*DATASETS, "scenes"]
 
 
 def load_frames(dataset: str, root: str | Path | None = None, *, count: int = 20) -> list[Frame]:
@@ -179,7 +191,7 @@ def load_frames(dataset: str, root: str | Path | None = None, *, count: int = 20
     if dataset == "scenes":
         return scenes(count)
     if dataset not in DATASETS:
-        raise UnknownNameError(did_you_mean("data set", dataset, [*DATASETS, "scenes"]))
+        raise UnknownNameError(did_you_mean("data set", dataset, dataset_names()))
     if root is None:
         raise OptionError(f"root must name the folder of data set {dataset!r}, got none")
     return DATASETS[dataset](root)

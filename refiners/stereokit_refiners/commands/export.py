@@ -60,7 +60,9 @@ def export(
     needed = ["onnxruntime"] + (["openvino"] if format == "openvino" else [])
     for module in needed:
         if importlib.util.find_spec(module) is None:
-            raise StereokitError(f"export needs {module}, which is not installed: pip install 'stereokit[onnx,fast]'")
+            raise StereokitError(
+                f"export needs {module}, which is not installed: pip install 'stereokit[onnx,refiners]'"
+            )
     model = onnx_model(content)
     difference = largest_difference(content, model)
     if not difference <= TOLERANCE_PX:

@@ -58,7 +58,7 @@ def opencv_threads(count: int) -> Iterator[None]:
 
 def compiled(
     network: Network, weights: Weights, rows: int, columns: int, threads: int
-) -> Callable[[dict[str, NDArray[np.float32]]], NDArray[np.float32]]:
+) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
     """Compile for a size; return a function from (C, h, w) inputs to the (h, w, C) head, safe to call in parallel."""
     model = np.frombuffer(head_graph(network, weights, rows, columns), np.uint8)
 
@@ -69,10 +69,10 @@ def compiled(
 
     nets: Pool[Any] = Pool(loaded)
 
-    def run(inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
         with nets.take() as net, opencv_threads(threads):
             for name in network.inputs:
-                net.setInput(np.ascontiguousarray(inputs[name][None]), name)
+                net.setInput(np.ascontiguousarray(inputs[name][None], np.float32), name)
             return np.array(net.forward()[0], np.float32)
 
     return run

@@ -199,6 +199,9 @@ class Matcher:
     def on_device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
         """Match a rectified pair that lies on the GPU, such as PyTorch's CUDA tensors; the map stays there.
 
+        The images are taken as they are: nobody looks for black borders, areas without texture or faults of the pair,
+        for which the matcher itself, called with images of the host, looks.
+
         Parameters
         ----------
         left, right : (H, W) or (H, W, 3) uint8, C-contiguous, with ``__cuda_array_interface__``

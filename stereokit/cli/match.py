@@ -185,7 +185,7 @@ def match(
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
         raise InputError(f"LEFT and RIGHT must have the same size, got {sizes}")
     camera = _read_camera(calibration, cameras, calibration_scale, width, height)
-    masks: dict[str, NDArray[Any] | None] = {}
+    masks: dict[str, NDArray[Any]] = {}
     if rig is not None:
         rectification = read_rig_option(rig, (width, height)).rectification(alpha=alpha)
         images, camera = rectification(*images), rectification.calibration
@@ -193,7 +193,8 @@ def match(
         width, height = rectification.size
     for name, file in {"mask": mask, "right_mask": right_mask}.items():
         drawn, seen = read_mask(f"--{name.replace('_', '-')}", file, (height, width)), masks.get(name)
-        masks[name] = drawn if seen is None else seen if drawn is None else drawn & seen
+        if drawn is not None:
+            masks[name] = drawn if seen is None else drawn & seen
     if align:
         images = images[0], aligned(*images, nodata)
 

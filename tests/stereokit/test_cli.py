@@ -56,6 +56,7 @@ class FakeMatcher:
 def matching(monkeypatch):
     module = types.ModuleType("stereokit.matching")
     module.Matcher = FakeMatcher
+    module.compile_kernels = lambda matcher, *kind: matcher(*[np.zeros((4, 4), np.uint8)] * 2)
     module.METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+sgm"}
     monkeypatch.setitem(sys.modules, "stereokit.matching", module)
     monkeypatch.setattr(FakeMatcher, "instances", [])
@@ -233,7 +234,7 @@ def test_json_to_the_terminal(tmp_path, pair):
         (["-o", "{}/d.png", "--right", "{}/nowhere/r.png"], "--right"),
         (["-o", "{}/d.png", "--confidence", "{}/k.pfm"], "--confidence must end in"),
         (["-o", "{}/d.png", "--ply", "{}/p.obj"], "--ply must end in"),
-        (["-o", "{}/d.png", "--ply", "{}/p.ply"], "--ply and --calibration go together"),
+        (["-o", "{}/d.png", "--ply", "{}/p.ply"], "--ply and --depth go together with --calibration"),
         (["-o", "{}/d.png", "--calibration", "{}/calibration.json"], "go together"),
         (["-o", "{}/d.png", "--ply", "{}/p.ply", "--calibration", "{}/left.png"], "not a text file"),
         (["-o", "{}/d.png", "--ply", "{}/p.ply", "--calibration", "{}/large.json"], "9x6 pixels"),

@@ -184,7 +184,7 @@ def test_match_writes_everything_else(tmp_path, pair):
     cloud = (tmp_path / "p.ply").read_bytes()
     assert b"element vertex 42\n" in cloud  # 6 * 7 pixels of finite depth
     vertices = np.frombuffer(cloud.split(b"end_header\n", 1)[1], np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
-    np.testing.assert_allclose(vertices["xyz"][0], [0.01, 0, 1])  # pixel (1, 0) at 100 * 0.1 / 10 metres
+    np.testing.assert_allclose(vertices["xyz"][0], [0.01, 0, -1])  # y up; pixel (1, 0) at 100 * 0.1 / 10 metres
     assert vertices["rgb"][0].tolist() == [3, 4, 5]
     report = json.loads((tmp_path / "j.json").read_text())
     assert (report["width"], report["height"], report["density"]) == (WIDTH, HEIGHT, 0.875)

@@ -6,11 +6,13 @@ BIN := $(VENV)/bin
 KERNEL_TESTS := sgm dt costs wta postprocess simd properties
 
 define MATCH_A_PAIR
-import cv2, numpy as np, stereokit
+import sys, cv2, numpy as np, stereokit
 from importlib.metadata import metadata
 left = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 96), dtype=np.uint8), (0, 0), 1)
 right = np.roll(left, -5, axis=1)
 assert abs(np.median(stereokit.match(left, right, max_disparity=16)) - 5) < 0.1
+refined = stereokit.match(left, right, max_disparity=16, scale=0.5, refiner="stereokit")
+assert abs(np.median(refined) - 5) < 0.2 and "openvino" not in sys.modules and "torch" not in sys.modules
 assert metadata("stereokit")["License-Expression"] == "MIT"
 cv2.imwrite("left.png", left), cv2.imwrite("right.png", right)
 print("the wheel works alone:", stereokit.__file__, metadata("stereokit")["License-Expression"])

@@ -54,8 +54,8 @@ class Matcher:
         0.5 and 0.25 match at half and at a quarter of the size, and let `refiner` bring the map to full size.
     refiner : str, callable or None
         The name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
-        `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones need
-        ``stereokit[refiners]``; those other than ``"general"`` need ``scale=0.5``.
+        `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones are
+        faster with ``stereokit[refiners]``; those other than ``"stereokit"`` and ``"auto"`` need ``scale=0.5``.
     device : {"auto", "cpu", "cuda"}
         Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``. "auto" is the CPU
         for now, with a GPU too: the kernels are tested in an interpreter and have not run on a GPU yet. Refiners run

@@ -1,8 +1,9 @@
 """The refiner ``"auto"``: the general one where it helps, linear upscaling where it does not.
 
 Linear is taken where the general refiner cannot run (no runtime computes its network rightly here), on a GPU, for which
-it has no kernels, and for images with a side below `SMALLEST` pixels, of which it sees too little. At full size, where
-linear upscaling changes nothing, that leaves the matcher's map as it is.
+it has no kernels, and for images with a side below `SMALLEST` pixels, which were not measured. At full size, where
+linear upscaling changes nothing, that leaves the matcher's map as it is. Scale is no reason: at 1, 0.5 and 0.25 the
+general one is better, and so it is for crops of a street down to 16x32 pixels (bad-1 38.7 % against linear's 44.9 %).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SMALLEST", "AutoRefiner"]
 
-SMALLEST = 32
+SMALLEST = 16
 """Rows and columns of the smallest image that the general refiner gets, pixels."""
 
 

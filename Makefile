@@ -3,19 +3,23 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
+KERNEL_TESTS := sgm dt costs wta postprocess simd properties
+
 define MATCH_A_PAIR
-import cv2, numpy as np, stereokit
+import sys, cv2, numpy as np, stereokit
 from importlib.metadata import metadata
 left = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 96), dtype=np.uint8), (0, 0), 1)
 right = np.roll(left, -5, axis=1)
 assert abs(np.median(stereokit.match(left, right, max_disparity=16)) - 5) < 0.1
+refined = stereokit.match(left, right, max_disparity=16, scale=0.5, refiner="stereokit")
+assert abs(np.median(refined) - 5) < 0.2 and "openvino" not in sys.modules and "torch" not in sys.modules
 assert metadata("stereokit")["License-Expression"] == "MIT"
 cv2.imwrite("left.png", left), cv2.imwrite("right.png", right)
 print("the wheel works alone:", stereokit.__file__, metadata("stereokit")["License-Expression"])
 endef
 export MATCH_A_PAIR
 
-.PHONY: demo docs test fuzz lint types package check clean
+.PHONY: demo docs test checked fuzz lint types package check clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -33,6 +37,9 @@ demo: $(VENV)/.user  ## match a synthetic street with S1 to S4: pictures in demo
 
 test: $(VENV)/.dev  ## all tests, two files at a time
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
+checked: $(VENV)/.dev  ## tests that drive the CPU's kernels, in a build that checks every access to an array
+	STEREOKIT_CHECKED=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(KERNEL_TESTS:%=tests/stereokit/test_%.py)
 
 fuzz: $(VENV)/.dev  ## generated calls and mutated files, ten minutes; FUZZ="--seed 2 --minutes 1" for others
 	cd tests && ../$(BIN)/python -m fuzz $(FUZZ)
@@ -57,7 +64,7 @@ package: $(VENV)/.dev  ## wheels and sdists; the main wheel alone, in an empty e
 	build/package/bin/pip install --quiet --disable-pip-version-check dist/stereokit-*.whl
 	cd build/package && bin/python -c "$$MATCH_A_PAIR" && bin/stereokit match left.png right.png -o map.pfm --max-disparity 16
 
-check: lint types test docs package  ## what CI runs
+check: lint types test checked docs package  ## what CI runs
 
 clean:  ## remove what the tasks made
 	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache build dist demo study docs/_build docs/_generated

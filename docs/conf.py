@@ -55,11 +55,14 @@ def resolve(app: Any, env: Any, node: Any, content: Any) -> Any:
     domain = env.domains["py"]
     for path in (target, f"{module}.{target}"):
         try:
-            found = pkgutil.resolve_name(path)
+            target_object = pkgutil.resolve_name(path)
         except (ImportError, AttributeError, ValueError):
             continue
         for name in domain.objects:
-            if name.split(".")[-1] == getattr(found, "__name__", "") and pkgutil.resolve_name(name) is found:
+            if (
+                name.split(".")[-1] == getattr(target_object, "__name__", "")
+                and pkgutil.resolve_name(name) is target_object
+            ):
                 return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", name, node, content)
         return None
     if re.match(r"stereokit\w*\.", target):

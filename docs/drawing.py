@@ -40,11 +40,11 @@ class Street:
         """Return a method's result."""
         return Matcher(method, max_disparity=LEVELS, **options)(self.scene.left, self.scene.right)
 
-    def panel(self, name: str, found: Disparity) -> Panel:
+    def panel(self, name: str, result: Disparity) -> Panel:
         """Return a map and its errors as a row of a picture."""
-        scored = score(found.disparity, noc=self.scene.noc, occ=self.scene.occ, measured=found.valid)
-        wrong = error_map(found.disparity, self.scene.occ, self.scene.noc, dilate=False)
-        return Panel(name, colorize(found.disparity, 0, self.high), wrong, scored.noc.all.filled.d1())
+        scored = score(result.disparity, noc=self.scene.noc, occ=self.scene.occ, measured=result.valid)
+        wrong = error_map(result.disparity, self.scene.occ, self.scene.noc, dilate=False)
+        return Panel(name, colorize(result.disparity, 0, self.high), wrong, scored.noc.all.filled.d1())
 
     def sheet(self, panels: list[Panel]) -> np.ndarray:
         """Return the rows under the left image and the true disparity."""
@@ -81,10 +81,10 @@ def refined(street: Street, method: str) -> Disparity:
 
 def measured_and_sure(street: Street) -> np.ndarray:
     """Return the map with its gaps, where it was measured, and the confidence, side by side."""
-    found = street.match("S2", fill=None, confidence=True)
-    assert found.confidence is not None
-    gray = [np.uint8(255) * found.valid.astype(np.uint8), np.rint(255 * found.confidence).astype(np.uint8)]
-    pictures = [colorize(found.disparity, 0, street.high), *(cv2.cvtColor(g, cv2.COLOR_GRAY2RGB) for g in gray)]
+    result = street.match("S2", fill=None, confidence=True)
+    assert result.confidence is not None
+    gray = [np.uint8(255) * result.valid.astype(np.uint8), np.rint(255 * result.confidence).astype(np.uint8)]
+    pictures = [colorize(result.disparity, 0, street.high), *(cv2.cvtColor(g, cv2.COLOR_GRAY2RGB) for g in gray)]
     size = (TILE, round(TILE * HEIGHT / WIDTH))
     tiles = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
     gap = np.full((size[1], 6, 3), 255, np.uint8)
@@ -92,16 +92,16 @@ def measured_and_sure(street: Street) -> np.ndarray:
 
 
 def depth_error() -> bytes:
-    """Return a chart of depth errors by distance: what geometry says, and what S2 does on some streets."""
-    truth, found = [], []
+    """Return a chart of depth errors by distance: by geometry, and of S2 on some streets."""
+    truth, depths = [], []
     for seed in range(STREETS):
         scene = generate(seed)
         camera = Calibration(scene.focal_px, scene.focal_px, scene.cx, scene.cy, scene.baseline_m)
         result = Matcher("S2")(scene.left, scene.right)
         known = result.valid & np.isfinite(scene.noc)
         truth.append(camera.disparity_to_depth(scene.noc)[known])
-        found.append(result.depth(camera)[known])
-    distance, error = np.concatenate(truth), np.abs(np.concatenate(found) - np.concatenate(truth))
+        depths.append(result.depth(camera)[known])
+    distance, error = np.concatenate(truth), np.abs(np.concatenate(depths) - np.concatenate(truth))
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.add_subplot()
     z = np.linspace(4, FAR_M, 200)

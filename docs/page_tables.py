@@ -33,8 +33,8 @@ class Table:
 
     def number(self, row: str, column: str, place: int = -1) -> float | None:
         """Return one of the numbers of a cell, the last by default, or None if it has none."""
-        found = re.findall(r"\d+(?:\.\d+)?", self.rows[row][column])
-        return float(found[place]) if found else None
+        numbers = re.findall(r"\d+(?:\.\d+)?", self.rows[row][column])
+        return float(numbers[place]) if numbers else None
 
 
 def find(page: Path, head: str) -> Table:
@@ -45,15 +45,15 @@ def find(page: Path, head: str) -> Table:
     LookupError
         If there is no such table, or more than one.
     """
-    found = []
+    tables = []
     for block in re.findall(r"(?:^\|.*\n)+", page.read_text(encoding="utf-8") + "\n", flags=re.MULTILINE):
         lines = block.splitlines()
         if head in [_plain(cell) for cell in lines[0].strip().strip("|").split("|")]:
             below = page.read_text(encoding="utf-8").split(block)[1].strip().split("\n\n")[0]
-            found.append(Table(lines, below))
-    if len(found) != 1:
-        raise LookupError(f"{page.name} must have one table with a column {head!r}, got {len(found)}")
-    return found[0]
+            tables.append(Table(lines, below))
+    if len(tables) != 1:
+        raise LookupError(f"{page.name} must have one table with a column {head!r}, got {len(tables)}")
+    return tables[0]
 
 
 def tradeoff(measured: Table) -> bytes:
@@ -64,8 +64,8 @@ def tradeoff(measured: Table) -> bytes:
         time, error = measured.number(name, "2 threads"), measured.number(name, "D1 noc")
         if time is None or error is None:
             continue
-        peer, census = name.startswith("OpenCV"), "census" in name
-        axes.plot(time, error, "o", color="0.5" if peer else "tab:blue")
+        is_baseline, census = name.startswith("OpenCV"), "census" in name
+        axes.plot(time, error, "o", color="0.5" if is_baseline else "tab:blue")
         axes.annotate(
             name, (time, error), xytext=(-7 if census else 7, 0), textcoords="offset points", fontsize=9,
             ha="right" if census else "left", va="center", color="0.3",

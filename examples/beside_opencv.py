@@ -1,4 +1,4 @@
-"""stereokit beside OpenCV's StereoSGBM: the same pair, timed in turns, and what differs in units and gaps.
+"""stereokit and OpenCV's StereoSGBM: the same pair, timed in turns, with the differences in units and gaps.
 
 ``python beside_opencv.py left.png right.png`` takes a rectified pair; without arguments it draws a synthetic street.
 """
@@ -22,15 +22,15 @@ cv2.setNumThreads(1)  # as many as the matcher below
 sgbm = cv2.StereoSGBM_create(0, 64, 5, P1=200, P2=800, mode=cv2.StereoSGBM_MODE_SGBM_3WAY)
 matcher = stereokit.Matcher("S2", max_disparity=64, threads=1)
 calls = {"OpenCV 3WAY": lambda: sgbm.compute(left, right), "stereokit S2": lambda: matcher(left, right)}
-found = {name: call() for name, call in calls.items()}  # the first call compiles: not timed
+outputs = {name: call() for name, call in calls.items()}  # the first call compiles: not timed
 times = {name: [] for name in calls}
 for _ in range(9):
     for name, call in calls.items():  # in turns, so that a busy moment of the machine hits both
         times[name].append(timeit.timeit(call, number=1))
-# OpenCV: int16 in sixteenths of a pixel, and (minDisparity - 1) * 16, here -16, where it found nothing.
-# stereokit: float32 in pixels, dense, and .valid tells what was measured; the rest was filled from its row.
-result = found["stereokit S2"]
-opencv = stereokit.io.from_opencv(found["OpenCV 3WAY"])  # float32 pixels, NaN where it found nothing
+# OpenCV: int16 in sixteenths of a pixel, and (minDisparity - 1) * 16, here -16, where there is no disparity.
+# stereokit: float32 in pixels, dense; .valid is True at measured pixels, the others are filled from their rows.
+result = outputs["stereokit S2"]
+opencv = stereokit.io.from_opencv(outputs["OpenCV 3WAY"])  # float32 pixels, NaN where there is none
 maps = {"OpenCV 3WAY": opencv, "stereokit S2": np.where(result.valid, result.disparity, np.nan)}
 for name, disparity in maps.items():
     print(f"{name}: {1000 * np.median(times[name]):.1f} ms, {100 * np.isfinite(disparity).mean():.0f} % measured")

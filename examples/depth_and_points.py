@@ -22,12 +22,13 @@ else:
     camera = stereokit.Calibration(scene.focal_px, scene.focal_px, scene.cx, scene.cy, scene.baseline_m)
 
 result = stereokit.Matcher("S2", max_disparity=64)(left, right)
-depth_m = np.where(result.valid, result.depth(camera), np.nan)  # measured pixels only; filled ones have a depth too
+depth_m = result.depth(camera)  # of measured pixels only
 near, middle, far = np.nanpercentile(depth_m, (5, 50, 95))
 one_pixel = middle**2 / (camera.fx * camera.baseline_m)  # how far depth moves when disparity moves by one pixel
 print(f"depth: {near:.1f} m to {far:.1f} m, median {middle:.1f} m, where one pixel is {one_pixel:.2f} m")
 
-kept = np.isfinite(depth_m) & (depth_m < 80)  # what lies farther is mostly noise
+points_m = result.points(camera, max_depth=80, frame="y-up")  # what lies farther is mostly noise
+usable = np.isfinite(points_m).all(axis=2)
 colors = left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2)
-stereokit.io.write_ply("points.ply", result.points(camera)[kept], colors[kept])  # x right, y down, z forward, metres
-print(f"points.ply: {np.count_nonzero(kept)} points")
+stereokit.io.write_ply("points.ply", points_m[usable], colors[usable], "x right, y up, z backward; metres")
+print(f"points.ply: {np.count_nonzero(usable)} points")

@@ -19,8 +19,10 @@ from stereokit.io import read_disparity, read_image, write_disparity
 from stereokit.large import LargeResult, match_large
 from stereokit.matching import METHODS, Matcher, match, warmup
 from stereokit.notices import PairWarning
+from stereokit.pairs import Fault, PairReport, align_rows, check_pair
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit.result import Disparity
+from stereokit.rig import StereoRig, read_rig
 from stereokit.selection import select
 from stereokit.stages import aggregate, cost_volume
 
@@ -33,24 +35,30 @@ __all__ = [
     "Census",
     "DeviceError",
     "Disparity",
+    "Fault",
     "FileError",
     "InputError",
     "LargeResult",
     "Matcher",
     "OptionError",
+    "PairReport",
     "PairWarning",
     "RowCost",
+    "StereoRig",
     "StereokitError",
     "StereokitWarning",
     "UnknownNameError",
     "Zncc",
     "__version__",
     "aggregate",
+    "align_rows",
+    "check_pair",
     "cost_volume",
     "match",
     "match_large",
     "read_disparity",
     "read_image",
+    "read_rig",
     "select",
     "warmup",
     "write_disparity",

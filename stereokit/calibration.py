@@ -5,48 +5,35 @@ Both cameras share ``fx``, ``fy`` and ``cy``. With ``d = x_left - x_right`` and 
 brackets ``doffs``. ``Q`` is the same statement as the matrix of ``cv2.reprojectImageTo3D`` (Bradski and
 Kaehler, Learning OpenCV, ch. 12).
 
-Files: Middlebury ``calib.txt`` (2014 and later, ETH3D too; baseline in millimetres), KITTI
-``calib_cam_to_cam.txt`` and per-frame files (``P = K [I | t]``; the devkit's ``b = -P[0, 3] / fx``), and a
-plain JSON object.
+Files of other programs are read by `stereokit.io.calibrations`; here they must be of a rectified pair.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
-import re
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereokit.errors import FileError, InputError, OptionError
-from stereokit.io import parsing, read_text
+from stereokit.errors import FileError, InputError, OptionError, UnknownNameError, did_you_mean
+from stereokit.io import parsing
+from stereokit.io.calibrations import Content, check_projections, read_content
+from stereokit.io.calibrations.dispatch import name_of
+from stereokit.io.calibrations.units import in_metres
 from stereokit.notices import warn
 
-__all__ = ["Calibration", "read_calibration"]
+__all__ = ["FRAMES", "Calibration", "read_calibration"]
 
-_CENTRE_PX, _SHARE = 0.5, 0.001
-"""Tolerances of the shared values of rectified cameras: of principal points, pixels; of focal lengths, relative."""
-_BASELINES_M = 0.001, 100.0
-"""Range of baselines without a warning: others are mostly in another unit."""
-_KINDS = "known are Middlebury's calib.txt, KITTI's files, and JSON with fx, fy, cx0, cy, baseline_m"
-_OTHER_KINDS = {
-    "an OpenCV calibration (YAML)": r"\A%YAML|!!opencv-matrix",
-    "an OpenCV calibration (XML)": r"<opencv_storage>",
-    "an OpenCV calibration (JSON)": r'"opencv-matrix"',
-    "a ROS camera_info file": r"^[ \t]*(projection_matrix|distortion_model|camera_name)\s*:",
-    "a Kalibr camchain": r"^[ \t]*(T_cn_cnm1|distortion_coeffs|rostopic)\s*:",
-    "a BoofCV calibration": r"^[ \t]*leftToRight\s*:|boofcv",
-    "a ZED settings file": r"^[ \t]*\[(LEFT|RIGHT|STEREO)(_CAM_\w+)?\]",
-    "a calibration in XML": r"\A<",
-    "a calibration of Cityscapes (JSON)": r'"(intrinsic|extrinsic)"\s*:',
-    "a file of bare numbers, such as K.txt": r"\A[-+.\deE\s,;\[\]()]+\Z",
+FRAMES = {
+    "optical": "x right, y down, z forward",
+    "y-up": "x right, y up, z backward",
+    "ros": "x forward, y left, z up",
 }
-"""Kinds of files of other programs, each with the pattern that identifies it."""
+"""Frames of points, and their axes: that of images and OpenCV; that of OpenGL, in which viewers show the scene upright;
+and that of the body of a ROS robot (REP 103)."""
 
 
 @dataclass(frozen=True)
@@ -143,13 +130,15 @@ class Calibration:
         depth[np.isinf(depth)] = np.nan
         return depth
 
-    def points(self, disparity: ArrayLike) -> NDArray[np.float32]:
-        """Return the point of every pixel in the left camera's frame: x right, y down, z forward.
+    def points(self, disparity: ArrayLike, frame: str = "optical") -> NDArray[np.float32]:
+        """Return the point of every pixel in a frame of the left camera.
 
         Parameters
         ----------
         disparity : (H, W) float
             Pixels, not finite where invalid.
+        frame : {"optical", "y-up", "ros"}
+            The axes, see `FRAMES`: x right, y down, z forward; x right, y up, z backward; x forward, y left, z up.
 
         Returns
         -------
@@ -160,13 +149,21 @@ class Calibration:
         ------
         InputError
             If `disparity` is not a 2-d array of floats or has another size than the calibration.
+        UnknownNameError
+            If there is no such frame.
         """
+        if not isinstance(frame, str) or frame not in FRAMES:
+            raise UnknownNameError(did_you_mean("frame", frame, FRAMES))
         depth = self.disparity_to_depth(disparity)
         height, width = depth.shape
         points = np.empty((height, width, 3), np.float32)
         points[..., 0] = depth * ((np.arange(width) - self.cx0) / self.fx).astype(np.float32)
         points[..., 1] = depth * ((np.arange(height) - self.cy) / self.fy).astype(np.float32)[:, None]
         points[..., 2] = depth
+        if frame == "y-up":
+            points[..., 1:] *= -1
+        elif frame == "ros":
+            points = np.stack([points[..., 2], -points[..., 0], -points[..., 1]], axis=-1)
         return points
 
     def scaled(self, factor: float) -> Calibration:
@@ -227,164 +224,82 @@ def _pixels(name: str, value: float) -> int:
 
 
 def read_calibration(
-    path: str | os.PathLike[str], cameras: tuple[int, int] = (2, 3), size: tuple[int, int] | None = None
+    path: str | os.PathLike[str],
+    cameras: tuple[int, int] | None = None,
+    size: tuple[int, int] | None = None,
+    *,
+    right: str | os.PathLike[str] | None = None,
+    unit: str | None = None,
 ) -> Calibration:
-    """Read a calibration file; the format is recognised by the content.
+    """Read the calibration file of a rectified pair; its content identifies the format.
 
     Parameters
     ----------
     path : path
-        Middlebury or ETH3D ``calib.txt``, KITTI ``calib_cam_to_cam.txt`` or per-frame file, or a JSON object
-        with ``fx``, ``fy``, ``cx0``, ``cy``, ``baseline_m`` and optionally ``cx1``, ``width``, ``height``.
-    cameras : pair of int
-        Left and right camera of a KITTI file: (2, 3) is the colour pair, (0, 1) the grey one.
+        Middlebury or ETH3D ``calib.txt``; KITTI ``calib_cam_to_cam.txt`` or per-frame file; OpenCV's YAML, XML or JSON
+        with P1 and P2, or Q; the left of two ROS camera_info files; K.txt with a baseline; a JSON object with ``fx``,
+        ``fy``, ``cx0``, ``cy``, ``baseline_m`` and optionally ``cx1``, ``width``, ``height``; a folder with such files.
+    cameras : pair of int or None
+        Left and right camera of a KITTI file: (2, 3), the default, is the colour pair, (0, 1) the grey one.
     size : pair of int or None
-        Width and height of the images, pixels.
+        Expected width and height of the images, pixels.
+    right : path or None
+        The second of two files, such as ROS's right.yaml.
+    unit : {"m", "cm", "mm", "in"} or None
+        Unit of the lengths in the file. None is that of the file or format, or else metres; without either, a baseline
+        of 10 or more is taken for millimetres, with a warning.
 
     Warns
     -----
     StereokitWarning
-        If the baseline is under 1 mm or over 100 m, or the principal point lies outside of the image.
+        If the baseline is under 1 mm or over 100 m or in a doubtful unit, or the principal point lies outside of the
+        image.
 
     Raises
     ------
     InputError
         If it is for images of another `size`.
     FileError
-        If the file is missing, is of no known format, lacks a field, or contradicts itself: the two cameras of a
-        rectified pair share fx, fy and cy, have no skew, and ``doffs`` is the difference of their cx.
+        If the file is missing, of an unknown format, of raw cameras (`stereokit.read_rig` reads those), incomplete or
+        contradictory: the two cameras of a rectified pair share fx, fy and cy, have no skew, and ``doffs`` is the
+        difference of their cx.
     """
-    camera = _read(path, cameras)
+    paths = [path] if right is None else [path, right]
+    name = name_of(paths)
+    content = in_metres(read_content(paths, cameras, size), unit, name)
+    with parsing(name, "calibration"):
+        camera = _rectified(content, name)
     if size is not None:
         camera.check_size(*size)
-    if not _BASELINES_M[0] <= camera.baseline_m <= _BASELINES_M[1]:
-        warn(f"{str(path)!r} has a baseline of {camera.baseline_m:g} m: is it in the unit that it should be in?")
     width, height = size or (camera.width, camera.height)
-    for name, center, pixels in (("cx0", camera.cx0, width), ("cy", camera.cy, height)):
+    for field, center, pixels in (("cx0", camera.cx0, width), ("cy", camera.cy, height)):
         if pixels is not None and not -0.5 <= center <= pixels - 0.5:
-            warn(f"{str(path)!r} has its principal point outside of the image: {name} is {center:g} of {pixels} pixels")
+            warn(f"{name!r} has its principal point outside of the image: {field} is {center:g} of {pixels} pixels")
     return camera
 
 
-def _read(path: str | os.PathLike[str], cameras: tuple[int, int]) -> Calibration:
-    text = read_text(path, "calibration")
-    with parsing(path, "calibration"):
-        if other := _other_kind(text):
-            raise FileError(f"{str(path)!r} looks like {other}, which is not read; {_KINDS}")
-        if text.lstrip().startswith("{"):
-            return _from_json(text)
-        if re.search(r"^[ \t]*\w+[ \t]*=", text, re.MULTILINE):
-            return _from_middlebury(dict(re.findall(r"^[ \t]*(\w+)[ \t]*=(.*)$", text, re.MULTILINE)))
-        if re.search(r"^[ \t]*\w+:", text, re.MULTILINE):
-            return _from_kitti(dict(re.findall(r"^[ \t]*(\w+):(.*)$", text, re.MULTILINE)), cameras)
-    raise FileError(f"{str(path)!r} is no calibration known here; {_KINDS}")
-
-
-def _other_kind(text: str) -> str | None:
-    """Return the kind of another program's file, with its article, or None if it is of no known kind."""
-    start = text.lstrip()
-    for kind, pattern in _OTHER_KINDS.items():
-        if re.search(pattern, start, re.MULTILINE):
-            return kind
-    return None
-
-
-def _from_json(text: str) -> Calibration:
-    fields = {field.name: field.default is dataclasses.MISSING for field in dataclasses.fields(Calibration)}
-    try:
-        content: Any = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise OptionError(f"not valid JSON, line {error.lineno}: {error.msg}") from error
-    for name, value in content.items():
-        if name not in fields:
-            raise OptionError(f"unknown field {name!r}. Known: {', '.join(fields)}")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise OptionError(f"{name} must be a number, got {value!r}")
-    missing = [name for name, needed in fields.items() if needed and name not in content]
-    if missing:
-        raise OptionError(f"it has no field {missing[0]!r}, which a calibration in JSON has")
-    return Calibration(**content)
-
-
-def _numbers(lines: dict[str, str], name: str, count: int, kind: str) -> list[float]:
-    if name not in lines:
-        raise OptionError(f"it has no field {name!r}, which {kind} has; {_KINDS}")
-    words = lines[name].translate(str.maketrans("[];,", "    ")).split()
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise OptionError(f"{name} must hold {count} numbers, got {lines[name].strip()!r}") from error
-    if len(values) != count:
-        raise OptionError(f"{name} must hold {count} numbers, got {len(values)}")
-    if not all(map(math.isfinite, values)):
-        raise OptionError(f"{name} must hold finite numbers, got {lines[name].strip()!r}")
-    return values
-
-
-def _from_middlebury(lines: dict[str, str]) -> Calibration:
-    kind = "a Middlebury calib.txt"
-    left = _numbers(lines, "cam0", 9, kind)
-    _check_pinhole("cam0", left[0], left[1], left[3], left[6:])
-    right = None
-    if "cam1" in lines:
-        right = _numbers(lines, "cam1", 9, kind)
-        _check_pinhole("cam1", right[0], right[1], right[3], right[6:])
-        _check_rectified("cam0", (left[0], left[4], left[5]), "cam1", (right[0], right[4], right[5]))
-    if right is None or "doffs" in lines:
-        doffs = _numbers(lines, "doffs", 1, kind)[0]
-    else:
-        doffs = right[2] - left[2]
-    if right is not None and abs(doffs - (right[2] - left[2])) > _CENTRE_PX:
-        raise OptionError(f"doffs is {doffs:g}, but cam0 and cam1 say {right[2] - left[2]:g} (cx1 - cx0)")
+def _rectified(content: Content, name: str) -> Calibration:
+    """Return the calibration of the rectified cameras of a file."""
+    if content.projections is None:
+        if content.lenses is not None and content.pose is not None:
+            raise FileError(
+                f"{name!r} is {content.kind} of raw cameras: its images must be rectified first, "
+                "which stereokit.read_rig and --rig do"
+            )
+        raise OptionError(
+            f"it is {content.kind} without the rectified cameras (P1 and P2, or Q, or both of left.yaml and right.yaml)"
+        )
+    baseline = check_projections(content)
+    left, right = content.projections
+    lens_size = None if content.lenses is None else content.lenses[0].size
+    width, height = content.size or lens_size or (None, None)
     return Calibration(
-        fx=left[0],
-        fy=left[4],
-        cx0=left[2],
-        cy=left[5],
-        baseline_m=_numbers(lines, "baseline", 1, kind)[0] / 1000,
-        cx1=left[2] + doffs,
-        **{name: _numbers(lines, name, 1, kind)[0] for name in ("width", "height") if name in lines},  # type: ignore[arg-type]
+        fx=float(left[0, 0]),
+        fy=float(left[1, 1]),
+        cx0=float(left[0, 2]),
+        cy=float(left[1, 2]),
+        baseline_m=baseline,
+        cx1=float(right[0, 2]),
+        width=width,
+        height=height,
     )
-
-
-def _from_kitti(lines: dict[str, str], cameras: tuple[int, int]) -> Calibration:
-    raw = any(name.startswith("P_rect_") for name in lines)
-    names = [f"P_rect_{camera:02d}" if raw else f"P{camera}" for camera in cameras]
-    left, right = (_numbers(lines, name, 12, "a KITTI calibration") for name in names)
-    for name, matrix in zip(names, (left, right), strict=True):
-        _check_pinhole(name, matrix[0], matrix[1], matrix[4], matrix[8:11])
-    _check_rectified(names[0], (left[0], left[5], left[6]), names[1], (right[0], right[5], right[6]))
-    baseline_m = right[3] / -right[0] - left[3] / -left[0]
-    if not baseline_m > 0:
-        raise OptionError(f"{names[1]} must lie to the right of {names[0]}, got a baseline of {baseline_m} m")
-    size = f"S_rect_{cameras[0]:02d}"
-    width, height = _numbers(lines, size, 2, "a KITTI calibration") if raw and size in lines else (None, None)
-    return Calibration(
-        fx=left[0],
-        fy=left[5],
-        cx0=left[2],
-        cy=left[6],
-        baseline_m=baseline_m,
-        cx1=right[2],
-        width=width,  # type: ignore[arg-type]
-        height=height,  # type: ignore[arg-type]
-    )
-
-
-def _check_pinhole(name: str, focal: float, skew: float, below: float, last: list[float]) -> None:
-    """Refuse a camera matrix with more than a focal length and a principal point."""
-    if not focal > 0:
-        raise OptionError(f"{name} must begin with a positive focal length, got {focal:g}")
-    if abs(skew) > _CENTRE_PX:
-        raise OptionError(f"{name} must be of a rectified camera, without skew, got a skew of {skew:g}")
-    if abs(below) > _CENTRE_PX or max(abs(a - b) for a, b in zip(last, (0, 0, 1), strict=True)) > _SHARE:
-        raise OptionError(f"{name} must be a camera matrix, with 0 below its focal length and a last row of 0 0 1")
-
-
-def _check_rectified(
-    left: str, left_values: tuple[float, float, float], right: str, right_values: tuple[float, float, float]
-) -> None:
-    """Refuse two cameras that differ in the values that rectified ones share: fx, fy and cy."""
-    for name, a, b in zip(("fx", "fy", "cy"), left_values, right_values, strict=True):
-        if abs(a - b) > (_CENTRE_PX if name == "cy" else _SHARE * abs(a)):
-            raise OptionError(f"{left} and {right} must share {name}, as rectified cameras do, got {a:g} and {b:g}")

@@ -48,11 +48,11 @@ class PairWatch:
         min_disparity, max_disparity : int
             Of the matcher, pixels.
         """
-        if same_pixels(pair.left, pair.right):
-            return view_warnings(True)
         usable = pair.left.size - (0 if pair.left_bad is None else int(np.count_nonzero(pair.left_bad)))
         if usable == 0:
             return ["no pixel is usable: mask, no-data value, alpha or black borders exclude them all"]
+        if same_pixels(pair.left, pair.right):
+            return view_warnings(True)
         density = np.count_nonzero(result.valid) / usable
         lines = density_warnings(density, min_disparity, max_disparity)
         residual = row_residual(pair, result.disparity, result.valid)

@@ -27,7 +27,7 @@ from stereokit.images.gray import GrayPair, gray_pair, guide_of
 from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
-from stereokit.options import MatchOptions, StageOptions
+from stereokit.options import MatchOptions, StageOptions, WarmupOptions
 from stereokit.pipeline import CpuPipeline, Pipeline, concluded, with_blank
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["METHODS", "Matcher", "match", "warmup"]
+__all__ = ["METHODS", "Matcher", "compile_kernels", "match", "warmup"]
 
 
 class Matcher:
@@ -54,8 +54,8 @@ class Matcher:
         0.5 and 0.25 match at half and at a quarter of the size, and let `refiner` bring the map to full size.
     refiner : str, callable or None
         The name of a refiner, a weight file (``.safetensors``), or a refiner itself (see
-        `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones need
-        ``stereokit[refiners]``; those other than ``"general"`` need ``scale=0.5``.
+        `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones are
+        faster with ``stereokit[refiners]``; those other than ``"stereokit"`` and ``"auto"`` need ``scale=0.5``.
     device : {"auto", "cpu", "cuda"}
         Where to compute; the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``. "auto" is the CPU
         for now, with a GPU too: the kernels are tested in an interpreter and have not run on a GPU yet. Refiners run
@@ -102,7 +102,7 @@ class Matcher:
             raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {shown(device)}")
         if device == "cuda":
             require_device()
-        self.threads = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
+        count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
         settings = MatchSettings.parse(
             method,
             max_disparity=max_disparity,
@@ -111,8 +111,7 @@ class Matcher:
             refiner=refiner,
             options={**options},
         )
-        self._pipeline: Pipeline = _pipeline(settings, device)
-        self._watch = PairWatch()
+        self._begin(_pipeline(settings, device), count)
 
     @property
     def settings(self) -> MatchSettings:
@@ -151,12 +150,12 @@ class Matcher:
 
     @property
     def refiner(self) -> str | None:
-        """The refiner's name, or the path of its weights; None at full size."""
+        """The refiner's name, or the path of its weights; None where no refiner runs."""
         return self.settings.refiner_name
 
     @property
     def refine(self) -> Callable[..., Disparity] | None:
-        """The refiner itself (`stereokit_refiners.contract.Refiner`); None at full size."""
+        """The refiner itself (`stereokit_refiners.contract.Refiner`); None where no refiner runs."""
         return self.settings.refiner
 
     @property
@@ -174,9 +173,14 @@ class Matcher:
     def replaced(self, **changes: Any) -> Matcher:
         """Return a matcher that differs in some of its `settings`, by their names."""
         matcher = Matcher.__new__(Matcher)
-        matcher.threads = self.threads
-        matcher._pipeline = self._pipeline.replaced(**changes)
+        matcher._begin(self._pipeline.replaced(**changes), self.threads)
         return matcher
+
+    def _begin(self, pipeline: Pipeline, threads: int) -> None:
+        """Set what every matcher has, however it is made."""
+        self._pipeline = pipeline
+        self.threads = threads
+        self._watch = PairWatch()
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
         """Return the bytes of the buffers for a pair; see `stereokit.pipeline.Pipeline`."""
@@ -186,11 +190,9 @@ class Matcher:
         return {"settings": self.settings, "threads": self.threads, "device": self.device}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.threads = state["threads"]
         if state["device"] == "cuda":
             require_device()
-        self._pipeline = _pipeline(state["settings"], state["device"])
-        self._watch = PairWatch()
+        self._begin(_pipeline(state["settings"], state["device"]), state["threads"])
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"
@@ -198,6 +200,9 @@ class Matcher:
 
     def on_device(self, left: Any, right: Any, stream: Any = None) -> DeviceDisparity:
         """Match a rectified pair that lies on the GPU, such as PyTorch's CUDA tensors; the map stays there.
+
+        The images are taken as they are: nobody looks for black borders, areas without texture or faults of the pair,
+        for which the matcher itself, called with images of the host, looks.
 
         Parameters
         ----------
@@ -455,7 +460,7 @@ def _file_version(option: Any) -> Any:
     return option
 
 
-def warmup(*methods: str, max_disparity: int = 128) -> None:
+def warmup(*methods: str, max_disparity: int = 128, **options: Unpack[WarmupOptions]) -> None:
     """Compile the kernels of the methods (or load them from the disk cache), so that no later call waits for it.
 
     Parameters
@@ -464,11 +469,34 @@ def warmup(*methods: str, max_disparity: int = 128) -> None:
         Methods; none means S1 to S4.
     max_disparity : int
         As it will be used: code is compiled per 64 levels.
+    **options
+        Those of `Matcher`, as they will be used.
+
+    Raises
+    ------
+    OptionError
+        If an option cannot be used.
     """
-    image = np.arange(16 * 16, dtype=np.uint8).reshape(16, 16)
+    values: dict[str, Any] = {**options, "max_disparity": max_disparity}
     for method in methods or METHODS:
-        with collecting():
-            Matcher(method, max_disparity=max_disparity)(image, image)
+        compile_kernels(Matcher(method, **values))
+
+
+def compile_kernels(matcher: Matcher, shape: tuple[int, ...] = (), dtype: Any = np.uint8) -> None:
+    """Compile what a matcher needs for images of a type, so that a time taken afterwards is that of matching.
+
+    Parameters
+    ----------
+    matcher : Matcher
+    shape : tuple of int
+        ``()`` for grey images, ``(3,)`` or ``(4,)`` for colour.
+    dtype : numpy type
+    """
+    side = 320  # speckles are a share of the pixels: at a quarter of the size there must be some to remove
+    image = np.zeros((side, side, *shape), dtype)
+    image[:, ::2] = 1
+    with collecting():
+        matcher(image, image)
 
 
 def _forget_matchers() -> None:

@@ -15,16 +15,16 @@ What has no counterpart is kept for its getter, and named in one warning. See do
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, OptionError, StereokitWarning
+from stereokit.errors import InputError, OptionError
 from stereokit.images.check import check_integer
 from stereokit.matching import Matcher
+from stereokit.notices import warn
 
 __all__ = [
     "STEREO_SGBM_MODE_HH",
@@ -89,14 +89,16 @@ class StereoSGBM:
     def matcher(self, pixels: int) -> Matcher:
         """Return the matcher for images of so many pixels: speckles are counted in pixels here, in shares there."""
         if pixels not in self._matchers:
-            given = self._parameters
+            parameters = self._parameters
             self._matchers[pixels] = Matcher(
                 "census+sgm",
-                min_disparity=given["minDisparity"],
-                max_disparity=given["minDisparity"] + given["numDisparities"],
-                uniqueness=given["uniquenessRatio"],
-                smp=given["disp12MaxDiff"] >= 0,
-                speckle=min((given["speckleWindowSize"] + 0.5) / pixels, 1) if given["speckleWindowSize"] else 0,
+                min_disparity=parameters["minDisparity"],
+                max_disparity=parameters["minDisparity"] + parameters["numDisparities"],
+                uniqueness=parameters["uniquenessRatio"],
+                smp=parameters["disp12MaxDiff"] >= 0,
+                speckle=min((parameters["speckleWindowSize"] + 0.5) / pixels, 1)
+                if parameters["speckleWindowSize"]
+                else 0,
                 fill=None,
             )
         return self._matchers[pixels]
@@ -238,11 +240,9 @@ class StereoSGBM:
 def _warn_of(names: list[str]) -> None:
     if names:
         many = len(names) > 1
-        warnings.warn(
+        warn(
             f"{', '.join(names)} {'have' if many else 'has'} no counterpart in stereokit and {'are' if many else 'is'} "
-            "not used; see docs/opencv.md",
-            StereokitWarning,
-            stacklevel=4,
+            "not used; see docs/opencv.md"
         )
 
 

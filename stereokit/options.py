@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 if TYPE_CHECKING:
     from stereokit.result import Disparity
 
-__all__ = ["MatchOptions", "StageOptions"]
+__all__ = ["MatchOptions", "StageOptions", "WarmupOptions"]
 
 
 class StageOptions(TypedDict, total=False):
@@ -51,15 +51,20 @@ class StageOptions(TypedDict, total=False):
     precision: str
 
 
-class MatchOptions(StageOptions, total=False):
-    """All options of `stereokit.match`."""
+class WarmupOptions(StageOptions, total=False):
+    """Options of `stereokit.warmup` beside the range's end."""
 
-    max_disparity: int
     min_disparity: int
     scale: float
     refiner: str | Callable[..., Disparity] | None
     device: Literal["auto", "cpu", "cuda"]
     threads: int | None
+
+
+class MatchOptions(WarmupOptions, total=False):
+    """All options of `stereokit.match`."""
+
+    max_disparity: int
 
 
 OPENCV_NAMES: dict[str, str] = {

@@ -134,7 +134,7 @@ def concluded(result: Disparity, pair: GrayPair, keeps_blank: bool = True) -> Di
     unmeasured = joined(bad, blank)
     if unmeasured is None:
         return result
-    parts = {"disparity": result.disparity, "valid": result.valid & ~unmeasured}
+    parts: dict[str, Any] = {"disparity": result.disparity, "valid": result.valid & ~unmeasured}
     empty = bad if keeps_blank else unmeasured
     if empty is not None:
         parts["disparity"] = np.where(empty, np.float32(np.nan), result.disparity)

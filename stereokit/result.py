@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereokit import io
 from stereokit.calibration import Calibration
 from stereokit.errors import InputError, OptionError
+from stereokit.images.check import check_flag, check_number
 
 __all__ = ["Disparity", "color_range", "colorize"]
 
@@ -104,16 +105,86 @@ class Disparity:
         """The share of pixels that were measured, from 0 to 1."""
         return float(np.count_nonzero(self.valid) / self.valid.size)
 
-    def depth(self, calibration: Calibration) -> NDArray[np.float32]:
+    def depth(
+        self, calibration: Calibration, *, filled: bool = False, max_depth: float | None = None
+    ) -> NDArray[np.float32]:
         """Return the depth, (H, W) float32 in metres, NaN where there is none.
 
-        Filled pixels have a depth too; mask with `valid` to keep measured ones only.
-        """
-        return calibration.disparity_to_depth(self.disparity)
+        Parameters
+        ----------
+        calibration : Calibration
+        filled : bool
+            Also of pixels that were not measured but filled.
+        max_depth : float or None
+            Metres beyond which there is none.
 
-    def points(self, calibration: Calibration) -> NDArray[np.float32]:
-        """Return the points in the left camera's frame, (H, W, 3) float32 metres, NaN where there is none."""
-        return calibration.points(self.disparity)
+        Raises
+        ------
+        InputError
+            If the calibration is for maps of another size.
+        OptionError
+            If `max_depth` is not positive.
+        """
+        return calibration.disparity_to_depth(self._depth_disparity(calibration, filled, max_depth))
+
+    def points(
+        self, calibration: Calibration, *, filled: bool = False, max_depth: float | None = None, frame: str = "optical"
+    ) -> NDArray[np.float32]:
+        """Return the points in a frame of the left camera, (H, W, 3) float32 metres, NaN where there is none.
+
+        Parameters
+        ----------
+        calibration : Calibration
+        filled, max_depth
+            As of `depth`.
+        frame : {"optical", "y-up", "ros"}
+            See `stereokit.calibration.FRAMES`.
+
+        Raises
+        ------
+        InputError
+            If the calibration is for maps of another size.
+        OptionError
+            If `max_depth` is not positive, or there is no such frame.
+        """
+        return calibration.points(self._depth_disparity(calibration, filled, max_depth), frame)
+
+    def _depth_disparity(self, calibration: Calibration, filled: bool, max_depth: float | None) -> NDArray[np.float32]:
+        """Return the map of the pixels that have a depth for the user."""
+        disparity = self.disparity if check_flag("filled", filled) else self.measured
+        if max_depth is None:
+            return disparity
+        farthest = check_number("max_depth", max_depth, 0, np.inf)
+        if farthest == 0:
+            raise OptionError("max_depth must be positive, got 0")
+        depth = calibration.disparity_to_depth(disparity)
+        return np.where(depth <= farthest, disparity, np.float32(np.nan))
+
+    def save_depth(
+        self, path: str | os.PathLike[str], calibration: Calibration, *, filled: bool = False,
+        max_depth: float | None = None,
+    ) -> None:  # fmt: skip
+        """Write the depth as ``.png`` (16-bit millimetres, 0 for none), ``.tiff`` or ``.npy`` (float32 metres, NaN).
+
+        See `stereokit.io.write_depth`. Only what was measured is written, unless `filled` is True.
+
+        Parameters
+        ----------
+        path : path
+        calibration : Calibration
+        filled, max_depth
+            As of `depth`.
+
+        Raises
+        ------
+        InputError
+            If the calibration is for maps of another size.
+        OptionError
+            If `max_depth` is not positive.
+        FileError
+            If the suffix is unknown or the file cannot be written.
+        """
+        io.write_depth(path, self.depth(calibration, filled=filled, max_depth=max_depth))
 
     def color(self, min: float | None = None, max: float | None = None) -> NDArray[np.uint8]:
         """Return the map as a picture, (H, W, 3) uint8 RGB; see `colorize`.
@@ -129,7 +200,8 @@ class Disparity:
     def save(self, path: str | os.PathLike[str], *, clip: bool = False) -> None:
         """Write `disparity` as ``.png`` (KITTI), ``.pfm``, ``.npy`` or ``.tiff``.
 
-        See `stereokit.io.write_disparity`. Filled values are written like measured ones.
+        See `stereokit.io.write_disparity`. Filled values are written like measured ones; ``write_disparity(path,
+        result.measured)`` leaves them out.
 
         Parameters
         ----------

@@ -34,7 +34,7 @@ settings.load_profile("stereokit")
 LONGEST = (
     "stereokit/test_portability", "arm/test_arm", "ptx/test_mutants", "ptx/test_end_to_end", "ptx/test_compile",
     "refiners/test_training", "evaluation/test_train", "evaluation/test_study", "evaluation/test_batch_dask",
-    "stereokit/test_interrupts", "examples/test_examples", "test_docs", "ptx/test_bench",
+    "stereokit/test_interrupts", "examples/test_examples", "test_docs", "test_contributing", "ptx/test_bench",
 )  # fmt: skip
 """Files that take longest for their few tests. They come first, or one of two workers ends long before the other."""
 

@@ -55,12 +55,12 @@ def census(left, right, minimum, count, width=9, height=7, outside=1.0):
     """Hamming distances of census transforms; `outside` is a share of the largest, None clamps borders."""
     across, down = width // 2, height // 2
     largest = width * height - 1
-    held = {}
+    transforms = {}
 
     def bits(name, image, y, x):
-        if (name, y, x) not in held:
-            held[name, y, x] = census_bits(image, y, x, across, down)
-        return held[name, y, x]
+        if (name, y, x) not in transforms:
+            transforms[name, y, x] = census_bits(image, y, x, across, down)
+        return transforms[name, y, x]
 
     def cost(y, x, xr):
         a, b = bits("left", left, y, x), bits("right", right, y, xr)
@@ -256,13 +256,13 @@ def median(disparity, size):
         for x in range(width):
             if math.isnan(disparity[y, x]):
                 continue
-            held = [
+            window = [
                 float(disparity[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)])
                 for dy in range(-half, half + 1)
                 for dx in range(-half, half + 1)
             ]
-            held = sorted(v for v in held if not math.isnan(v))
-            out[y, x] = held[(len(held) - 1) // 2]
+            window = sorted(v for v in window if not math.isnan(v))
+            out[y, x] = window[(len(window) - 1) // 2]
     return out
 
 
@@ -274,13 +274,13 @@ def remove_speckles(disparity, size, difference=1.0):
     fixed = {at: round(16 * float(disparity[at])) for at in valid}
     while fixed:
         region, edge = [], [next(iter(fixed))]
-        held = {edge[0]: fixed.pop(edge[0])}
+        values = {edge[0]: fixed.pop(edge[0])}
         while edge:
             y, x = at = edge.pop()
             region.append(at)
             for near in ((y - 1, x), (y + 1, x), (y, x - 1), (y, x + 1)):
-                if near in fixed and abs(fixed[near] - held[at]) <= 16 * difference:
-                    held[near] = fixed.pop(near)
+                if near in fixed and abs(fixed[near] - values[at]) <= 16 * difference:
+                    values[near] = fixed.pop(near)
                     edge.append(near)
         if len(region) <= size:
             for at in region:

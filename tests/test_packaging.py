@@ -31,10 +31,10 @@ def sources():
 def test_private_parts_of_numba_are_used_where_it_is_said():
     used: dict[str, set[str]] = {}
     for name, text in sources():
-        found = set(re.findall(r"""["']?(_nrt|forceinline)["']?\s*[=:]""", text))
-        found |= set(re.findall(r"^from (numba\.cuda|numba\.core\.caching) import", text, flags=re.M))
-        if found:
-            used[name] = found
+        parts = set(re.findall(r"""["']?(_nrt|forceinline)["']?\s*[=:]""", text))
+        parts |= set(re.findall(r"^from (numba\.cuda|numba\.core\.caching) import", text, flags=re.M))
+        if parts:
+            used[name] = parts
     assert used == PRIVATE
 
 
@@ -56,8 +56,8 @@ def test_the_licence_is_in_the_metadata():
 
 def test_weights_that_are_not_for_commercial_use_are_a_distribution_of_their_own():
     folder = pytest.importorskip("stereokit_kitti_weights").__path__[0]
-    told = metadata("stereokit-kitti-weights")
-    assert told["License-Expression"] == "CC-BY-NC-SA-3.0"
+    description = metadata("stereokit-kitti-weights")
+    assert description["License-Expression"] == "CC-BY-NC-SA-3.0"
     assert "CC BY-NC-SA 3.0" in (ROOT / "refiners/kitti/LICENSE").read_text(encoding="utf-8")
     assert {path.stem for path in Path(folder).glob("*.safetensors")} == {"cnn", "pyramid", "stereovae"}
 

@@ -3,12 +3,14 @@
 Importing this package imports neither torch nor any runtime: they are loaded when a refiner needs them.
 """
 
+from stereokit_refiners.auto import AutoRefiner
 from stereokit_refiners.contract import Refiner
 from stereokit_refiners.learned import CnnRefiner, EvidenceRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.weights import WeightFile
 
 __all__ = [
+    "AutoRefiner",
     "CnnRefiner",
     "EvidenceRefiner",
     "LearnedRefiner",

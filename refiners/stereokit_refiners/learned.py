@@ -1,7 +1,8 @@
 """Learned refiners: a network's weights behind the contract of `stereokit_refiners.contract`.
 
-The runtime is whatever is installed: OpenVINO first, then ONNX Runtime, then torch; and the precision what the
-processor is fast at: int8 where it has the instructions and the weights were calibrated, else bfloat16, else fp32.
+The runtime is what is installed: OpenVINO first, then ONNX Runtime, then torch, and OpenCV, which always is. The
+precision is what the processor is fast at: int8 where it has the instructions and the weights were calibrated, else
+bfloat16, else fp32.
 Before a process trusts a runtime with a network, it compares a small map with that of plain numpy
 (`stereokit_refiners.runtimes.reference`), and takes another runtime, with a warning, if they disagree. Networks
 compiled for a size are kept, a few at a time.
@@ -22,7 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import DeviceError, OptionError, StereokitError, StereokitWarning
+from stereokit.errors import DeviceError, OptionError, StereokitError
+from stereokit.notices import warn
 from stereokit.postprocess import fill
 from stereokit.registry import REFINERS
 from stereokit.result import Disparity
@@ -48,7 +50,8 @@ __all__ = [
     "learned_names",
 ]
 
-BACKENDS = ("openvino", "onnxruntime", "torch")
+BACKENDS = ("openvino", "onnxruntime", "torch", "opencv")
+"""The fastest first; the last comes with the base package."""
 PRECISIONS = ("fp32", "bf16", "int8")
 _MOST_COMPILED = 4  # networks
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
@@ -66,7 +69,7 @@ class LearnedRefiner:
     weights : str or None
         A weight file, or the name of an installed collection, such as ``"kitti"``; None takes those that come with the
         package.
-    backend : {"auto", "openvino", "onnxruntime", "torch"}
+    backend : {"auto", "openvino", "onnxruntime", "torch", "opencv"}
         What runs the network; "auto" is the first that is installed.
     precision : {"auto", "fp32", "bf16", "int8"}
         bf16 and int8 need OpenVINO. "auto" is the fastest that this processor has instructions for.
@@ -210,6 +213,16 @@ class LearnedRefiner:
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
 
+    def check_runtime(self) -> None:
+        """Choose the runtime now rather than at the first map.
+
+        Raises
+        ------
+        StereokitError
+            If none that is installed computes the network rightly here.
+        """
+        self._compiled.settle()
+
     def network_map(
         self, disparity: NDArray[np.float32], candidates: NDArray[np.float32] | None,
         confidence: NDArray[np.float32] | None, left: NDArray[Any], threads: int = 1,
@@ -254,12 +267,10 @@ class LearnedRefiner:
         if share > _FEW and not self._compiled.warned:
             self._compiled.warned = True
             lowered = f", {2 * shift:g} px taken off" if shift > 0 else ""
-            warnings.warn(
+            warn(
                 f"refiner {self._file.network!r} was trained on disparities from {low:g} to {high:g} px, "
                 f"{100 * share:.0f} % of this map lie beyond{lowered}: they come out 1 to 2 % too small; "
-                "refiner 'linear' takes any",
-                StereokitWarning,
-                stacklevel=3,
+                "refiner 'linear' takes any"
             )
 
     def _weighed(
@@ -277,9 +288,9 @@ class LearnedRefiner:
         gaps = bool(unknown.any())
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
-        found = hypotheses(disparity, coarse.candidates, left, right, step, threads)
-        inputs = {"evidence": network_input(found, coarse.confidence, left, columns, threads)}
-        full, sure = mixture(self._compiled.run(inputs, threads), found, rows, columns, threads)
+        values = hypotheses(disparity, coarse.candidates, left, right, step, threads)
+        inputs = {"evidence": network_input(values, coarse.confidence, left, columns, threads)}
+        full, sure = mixture(self._compiled.run(inputs, threads), values, rows, columns, threads)
         known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
         if gaps:
             missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
@@ -341,10 +352,8 @@ def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArra
 
 def _installed() -> list[str]:
     """Return the runtimes that are there, the best first."""
-    installed = [b for b in BACKENDS if importlib.util.find_spec(b) is not None]
-    if "onnxruntime" in installed and importlib.util.find_spec("onnx") is None:
-        installed.remove("onnxruntime")
-    return installed
+    installed = [name for name in BACKENDS[:-1] if importlib.util.find_spec(name) is not None]
+    return [*installed, "opencv"] if hasattr(cv2, "dnn") else installed
 
 
 def _backend(name: str) -> str:
@@ -354,13 +363,15 @@ def _backend(name: str) -> str:
     if name == "auto":
         if not installed:
             raise StereokitError(
-                "learned refiners need OpenVINO, ONNX Runtime or torch: pip install 'stereokit[refiners]', or "
-                "'stereokit[onnx]' where OpenVINO has no wheel"
+                "learned refiners need OpenCV's dnn, which this build lacks, or another runtime: pip install "
+                "'stereokit[refiners]', or 'stereokit[onnx]' where OpenVINO has no wheel"
             )
         return installed[0]
     if name not in installed:
-        extra = {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}[name]
-        raise StereokitError(f"backend {name!r} is not installed: pip install 'stereokit[{extra}]'")
+        way = {"openvino": "'stereokit[refiners]'", "onnxruntime": "'stereokit[onnx]'", "torch": "'stereokit[train]'"}
+        raise StereokitError(
+            f"backend {name!r} is not installed: pip install {way.get(name, 'opencv-python-headless')}"
+        )
     return name
 
 
@@ -412,7 +423,7 @@ def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, 
                 raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {reasons}")
             if wrong:
                 line = f"network {content.network!r} is run by {way[0]} in {way[1]}, since on this machine "
-                warnings.warn(line + "; ".join(wrong), RuntimeWarning, stacklevel=5)
+                warnings.warn(line + "; ".join(wrong), RuntimeWarning, stacklevel=6)
             _sound[key] = way
         return _sound[key]
 
@@ -428,6 +439,10 @@ def _compile(content: WeightFile, backend: str, precision: str, rows: int, colum
         from stereokit_refiners.runtimes.onnx import session
 
         return session(network, content.arrays, threads)
+    if backend == "opencv":
+        from stereokit_refiners.runtimes.opencv import compiled as compiled_by_opencv
+
+        return compiled_by_opencv(network, content.arrays, rows, columns, threads)
     from stereokit_refiners.runtimes.torch import runner
 
     return runner(network, content.arrays)
@@ -442,13 +457,18 @@ class _Compiled:
         self._lock = threading.Lock()
         self.warned = False
 
+    def settle(self) -> None:
+        """Take the backend and precision that compute the network rightly here."""
+        with self._lock:
+            if not self._runs:
+                self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
+
     def run(self, inputs: dict[str, NDArray[Any]], threads: int) -> NDArray[np.float32]:
         """Return the head for encoded inputs."""
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)
+        self.settle()
         with self._lock:
-            if not self._runs:
-                self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
             runner = self._runs.pop(key, None) or _compile(
                 self.content, self.backend, self.precision, rows, columns, threads
             )

@@ -29,6 +29,9 @@ from typer.core import TyperGroup
 from stereokit.cli.info import info, list_
 from stereokit.cli.match import match
 from stereokit.cli.output import version_of
+from stereokit.cli.pair import check
+from stereokit.cli.rig import rig
+from stereokit.cli.warmup import warmup
 from stereokit.errors import StereokitError, one_line
 from stereokit.notices import collecting
 
@@ -135,8 +138,11 @@ def _root(
 
 
 app.command()(match)
+app.command()(check)
 app.command("list")(list_)
 app.command()(info)
+app.command()(warmup)
+app.command()(rig)
 
 
 def _plugin(entry: metadata.EntryPoint) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ from stereokit.cli.options import (
     DeviceOption,
     FillOption,
     JsonOption,
+    LayoutOption,
     MaxDisparityOption,
     MethodOption,
     MinDisparityOption,
@@ -26,25 +28,37 @@ from stereokit.cli.options import (
     parse_settings,
 )
 from stereokit.cli.output import Table, report, version_of, waiting
-from stereokit.errors import InputError, OptionError
-from stereokit.notices import collecting
+from stereokit.cli.pair import (
+    AlignOption,
+    MaskOption,
+    NodataOption,
+    RightMaskOption,
+    StrictOption,
+    aligned,
+    read_mask,
+    strictly,
+)
+from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, read_rig_option, rig_files
+from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stereokit.calibration import Calibration
-    from stereokit.result import Disparity
 
 __all__ = ["match"]
 
 
 def match(
     left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a rectified pair.")],
-    right_image: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="FILE", help=".png (KITTI, x256), .pfm, .npy or .tiff."),
     ],
+    right_image: Annotated[
+        Path | None, typer.Argument(metavar="[RIGHT]", help="Right image, of the same size; none if LEFT holds both.")
+    ] = None,
+    layout: LayoutOption = None,
     method: MethodOption = "census+sgm",
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
@@ -61,10 +75,32 @@ def match(
         Path | None, typer.Option(metavar="FILE", help="Also the confidence: .npy, or .png (16-bit, x65535).")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Middlebury, KITTI or JSON calibration, for --ply.")
+        Path | None, typer.Option(metavar="FILE", help="Calibration of a rectified pair, for --ply and --depth.")
     ] = None,
+    calibration_scale: Annotated[
+        float, typer.Option(metavar="FACTOR", help="The images are so many times the size of the calibration's.")
+    ] = 1.0,
     cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Also a point cloud, metres.")] = None,
+    depth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also the depth: .png (16-bit mm), .tiff or .npy (metres).")
+    ] = None,
+    max_depth: Annotated[
+        float | None, typer.Option(metavar="METRES", help="No points and no depth beyond this.")
+    ] = None,
+    filled: Annotated[
+        bool, typer.Option("--filled", help="Points and depth also where values were filled in, not measured.")
+    ] = False,
+    frame: Annotated[
+        str, typer.Option(help="Axes of --ply: y-up (viewers), optical (y down, z forward) or ros (x forward, z up).")
+    ] = "y-up",
+    mask: MaskOption = None,
+    right_mask: RightMaskOption = None,
+    nodata: NodataOption = None,
+    align: AlignOption = False,
+    strict: StrictOption = False,
     memory: Annotated[str | None, typer.Option(metavar="BYTES", help="Match in windows that fit, such as 2GB.")] = None,
     overlap: Annotated[int | None, typer.Option(help="Margin of the windows of --memory, pixels.")] = None,
     json_file: JsonOption = None,
@@ -73,9 +109,8 @@ def match(
 
     Everything is checked before matching starts. The first run on a machine also compiles, once. With --memory the
     images (.npy, .tiff or any other) are matched in windows, and the map goes to .npy or tiled .tiff as it grows.
+    With --rig the images are raw ones: they are rectified first, and the map is that of the rectified left view.
     """
-    import numpy as np
-
     from stereokit import io
 
     suffixes = {
@@ -84,19 +119,35 @@ def match(
         "--right": (*io.DISPARITY_SUFFIXES, ".tif"),
         "--confidence": (".npy", ".png"),
         "--ply": (".ply",),
+        "--depth": io.DEPTH_SUFFIXES,
     }
-    paths = (output, color, right, confidence, ply)
+    paths = (output, color, right, confidence, ply, depth)
     outputs = {name: path for name, path in zip(suffixes, paths, strict=True) if path is not None}
     for name, path in outputs.items():
         io.check_output(path, suffixes[name], name)
         if name in ("--output", "--right") and path.suffix.lower() == ".png":
             check_fits_png(name, min_disparity, max_disparity)
     outputs.update(check_json(json_file))
-    _check_distinct({"LEFT": left, "RIGHT": right_image, "--calibration": calibration}, outputs)
-    if (ply is None) != (calibration is None):
-        raise OptionError("--ply and --calibration go together, got only one of them")
+    inputs = {"--calibration": calibration, "--mask": mask, "--right-mask": right_mask}
+    if rig is not None:
+        inputs.update(
+            {f"--rig {part}": Path(file) for part, file in zip(("LEFT", "RIGHT"), rig_files(rig), strict=False)}
+        )
+    _check_distinct({"LEFT": left, "RIGHT": right_image, **inputs}, outputs)
+    if layout is not None and right_image is not None:
+        raise OptionError("--layout is for one file with both views, got LEFT and RIGHT")
+    check_rig_options(rig, alpha, calibration)
+    if rig is None and (ply is None and depth is None) != (calibration is None):
+        raise OptionError("--ply and --depth go together with --calibration, got only one of them")
+    _check_metres(frame, max_depth, calibration_scale)
     options = parse_settings(settings or [])
-    flags = {"fill": fill, "weights": weights, "right": right and True, "confidence": confidence and True}
+    flags = {
+        "fill": fill,
+        "nodata": nodata,
+        "weights": weights,
+        "right": right and True,
+        "confidence": confidence and True,
+    }
     options.update({name: value for name, value in flags.items() if value is not None})
     matcher_options: dict[str, Any] = {
         "max_disparity": max_disparity,
@@ -107,34 +158,53 @@ def match(
         "device": device,
     }
     if memory is not None or overlap is not None:
-        for name in ("--color", "--right", "--confidence", "--ply"):
+        for name in ("--color", "--right", "--confidence", "--ply", "--depth"):
             if name in outputs:
                 raise OptionError(f"{name} is not available with --memory and --overlap")
+        if rig is not None:
+            raise OptionError("--rig is not available with --memory and --overlap; stereokit rectify comes before them")
+        for name, wanted in (("--align", align), ("--strict", strict)):
+            if wanted:
+                raise OptionError(f"{name} is not available with --memory and --overlap")
+        if right_image is None:
+            raise OptionError("RIGHT must be given with --memory and --overlap: one file with both views is read whole")
         from stereokit.cli.match_large import match_in_windows
 
+        mask_files = {"mask": mask, "right_mask": right_mask}
         content, table = match_in_windows(
-            left, right_image, output, method, memory, overlap, {**matcher_options, **options}
+            left, right_image, output, method, memory, overlap, {**matcher_options, **options, **mask_files}
         )
         report({**content, "options": options, "version": version_of("stereokit")}, [table], json_file)
         return
 
-    from stereokit.matching import Matcher
+    from stereokit.matching import Matcher, compile_kernels
 
     matcher = Matcher(method, **matcher_options, **options)
-    images = io.read_pair(left, right_image)
+    images = io.read_views(left, layout) if right_image is None else io.read_pair(left, right_image, alpha=True)
     height, width = images[0].shape[:2]
     if images[1].shape[:2] != (height, width):
         sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
         raise InputError(f"LEFT and RIGHT must have the same size, got {sizes}")
-    camera = _read_camera(calibration, cameras, width, height)
+    camera = _read_camera(calibration, cameras, calibration_scale, width, height)
+    masks: dict[str, NDArray[Any]] = {}
+    if rig is not None:
+        rectification = read_rig_option(rig, (width, height)).rectification(alpha=alpha)
+        images, camera = rectification(*images), rectification.calibration
+        masks.update(rectification.masks)
+        width, height = rectification.size
+    for name, file in {"mask": mask, "right_mask": right_mask}.items():
+        drawn, seen = read_mask(f"--{name.replace('_', '-')}", file, (height, width)), masks.get(name)
+        if drawn is not None:
+            masks[name] = drawn if seen is None else drawn & seen
+    if align:
+        images = images[0], aligned(*images, nodata)
 
     with waiting("Matching (the first run also compiles) ..."):
-        blanks = [np.zeros((32, 32, *image.shape[2:]), image.dtype) for image in images]
-        with collecting():
-            matcher(*blanks)  # compiles, so that the time below is that of matching
-        start = time.perf_counter()
-        result = matcher(*images)
-        seconds = time.perf_counter() - start
+        compile_kernels(matcher, images[0].shape[2:], images[0].dtype)
+        with strictly(strict):
+            start = time.perf_counter()
+            result = matcher(*images, **masks)
+            seconds = time.perf_counter() - start
 
     result.save(output, clip=True)  # its range was checked; a refiner may add a pixel
     if color is not None:
@@ -144,15 +214,19 @@ def match(
     if confidence is not None:
         _write_confidence(confidence, _require(result.confidence, "--confidence", matcher.method))
     if ply is not None and camera is not None:
-        _write_cloud(ply, result, camera, images[0])
+        points = result.points(camera, filled=filled, max_depth=max_depth, frame=frame)
+        _write_cloud(ply, points, frame, images[0], nodata)
+    if depth is not None and camera is not None:
+        result.save_depth(depth, camera, filled=filled, max_depth=max_depth)
     content = {
         "left": str(left),
-        "right": str(right_image),
+        "right": None if right_image is None else str(right_image),
         "outputs": {name.removeprefix("--"): str(path) for name, path in outputs.items() if name != "--json"},
         "width": width,
         "height": height,
         **matcher_report(matcher),
         "options": options,
+        **({} if rig is None else {"rig": rig, "alpha": alpha}),
         "density": result.density,
         "seconds": seconds,
         "version": version_of("stereokit"),
@@ -177,12 +251,29 @@ def _check_distinct(inputs: dict[str, Path | None], outputs: dict[str, Path]) ->
             raise OptionError(f"{name} and {first_name} must be different files, got {str(path)!r} for both")
 
 
-def _read_camera(path: Path | None, cameras: tuple[int, int], width: int, height: int) -> Calibration | None:
+def _check_metres(frame: str, max_depth: float | None, calibration_scale: float) -> None:
+    """Check the options of depth and points before anything is matched."""
+    from stereokit.calibration import FRAMES
+
+    if frame not in FRAMES:
+        raise UnknownNameError(did_you_mean("--frame", frame, FRAMES))
+    for name, value in (("--max-depth", max_depth), ("--calibration-scale", calibration_scale)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise OptionError(f"{name} must be positive, got {value:g}")
+
+
+def _read_camera(
+    path: Path | None, cameras: tuple[int, int], factor: float, width: int, height: int
+) -> Calibration | None:  # fmt: skip
     if path is None:
         return None
     from stereokit.calibration import read_calibration
 
-    return read_calibration(path, cameras, (width, height))
+    if factor == 1:
+        return read_calibration(path, cameras, (width, height))
+    camera = read_calibration(path, cameras).scaled(factor)
+    camera.check_size(width, height)
+    return camera
 
 
 def _require(array: NDArray[Any] | None, option: str, method: str) -> NDArray[Any]:
@@ -203,14 +294,14 @@ def _write_confidence(path: Path, confidence: NDArray[Any]) -> None:
         io.write_image(path, steps.astype(np.uint16))
 
 
-def _write_cloud(path: Path, result: Disparity, camera: Calibration, image: NDArray[Any]) -> None:
+def _write_cloud(path: Path, points: NDArray[Any], frame: str, image: NDArray[Any], nodata: float | None) -> None:
     import numpy as np
 
     from stereokit import io
+    from stereokit.calibration import FRAMES
     from stereokit.images.intensity import display_8bit
 
-    points = result.points(camera)
     finite = np.isfinite(points).all(axis=2)
-    picture = display_8bit(image)
+    picture = display_8bit(image, nodata)
     colors = picture if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)
-    io.write_ply(path, points[finite], colors[finite])
+    io.write_ply(path, points[finite], colors[finite], f"frame {frame}: {FRAMES[frame]}; metres")

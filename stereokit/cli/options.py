@@ -22,6 +22,7 @@ __all__ = [
     "DeviceOption",
     "FillOption",
     "JsonOption",
+    "LayoutOption",
     "MaxDisparityOption",
     "MethodOption",
     "MinDisparityOption",
@@ -45,6 +46,9 @@ MinDisparityOption = Annotated[int, typer.Option(help="Disparities searched star
 ScaleOption = Annotated[float, typer.Option(help="Match at this size, such as 0.5.")]
 RefinerOption = Annotated[str | None, typer.Option(help="Brings a scaled map to full size; see list.")]
 WeightsOption = Annotated[str | None, typer.Option(help="Of the refiner: a file, or a collection such as kitti.")]
+LayoutOption = Annotated[
+    str | None, typer.Option(help="Both views in one: side-by-side, right-left, top-bottom, bottom-top, pages.")
+]
 FillOption = Annotated[str | None, typer.Option(help="Of invalid pixels: nearest, background, none.")]
 DeviceOption = Annotated[str, typer.Option(help="auto (the CPU, for now), cpu or cuda.")]
 SettingsOption = Annotated[

@@ -70,12 +70,12 @@ class RowCost:
         height, width = pair.left.shape
         levels = pair.levels
         volume = workspace.array("custom.volume", (height, width, levels.count), np.uint8)
-        border_cost = np.uint8(self.cost_max if pair.outside is None else round(pair.outside * self.cost_max))
+        border_cost = np.uint8(self.cost_max if pair.border_share is None else round(pair.border_share * self.cost_max))
         columns = np.arange(width)[:, None] - np.arange(levels.count)[None, :] - levels.minimum
         no_match = (columns < 0) | (columns >= width)
         margin = 0
         left, right = pair.left, pair.right
-        if pair.outside is None:  # the function sees images that go on with their border pixels
+        if pair.border_share is None:  # the function sees images that go on with their border pixels
             margin = max(0, levels.minimum + levels.count - 1, -levels.minimum)
             left, right = (np.pad(image, ((0, 0), (margin, margin)), mode="edge") for image in (left, right))
 
@@ -83,7 +83,7 @@ class RowCost:
             wide = np.empty((left.shape[1], levels.count), np.uint8)
             for y in range(y0, y1):
                 row = volume[y]
-                if pair.outside is None:
+                if pair.border_share is None:
                     self.function(left, right, y, levels.minimum, wide)
                     row[:] = wide[margin : margin + width]
                 else:

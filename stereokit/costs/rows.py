@@ -77,7 +77,7 @@ class CostInput:
         Pixels that were NaN or infinite and carry no evidence; None when there are none.
     levels : Levels
         Disparities to try.
-    outside : float or None
+    border_share : float or None
         Cost of a level whose right pixel lies outside the image, as a share of the cost's range; None takes
         the nearest border pixel instead.
     threads : int
@@ -92,7 +92,7 @@ class CostInput:
     left_bad: NDArray[np.bool_] | None
     right_bad: NDArray[np.bool_] | None
     levels: Levels
-    outside: float | None
+    border_share: float | None
     threads: int = 1
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
@@ -175,21 +175,21 @@ def cell_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
     """Return the cells of `pair` without evidence, for costs of ``0..cost_max``; cached where no pixel is invalid."""
     if pair.left_bad is not None or pair.right_bad is not None:
         return _new_mask(pair, cost_max, Workspace())
-    key = pair.left.shape, pair.levels, pair.outside, cost_max
+    key = pair.left.shape, pair.levels, pair.border_share, cost_max
     return workspace.cached("cells", key, lambda: _new_mask(pair, cost_max, Workspace()))
 
 
 def _new_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
     height, width = pair.left.shape
     levels = pair.levels
-    border_cost = np.uint8(cost_max if pair.outside is None else round(pair.outside * cost_max))
+    border_cost = np.uint8(cost_max if pair.border_share is None else round(pair.border_share * cost_max))
     stride = width + levels.padded
     shared = pair.right_bad is None
     low = workspace.array("cells.low", (1 if shared else height, stride), np.uint8)
     high = workspace.array("cells.high", low.shape, np.uint8)
     columns = width - 1 - levels.minimum - np.arange(stride)
     inside = (columns >= 0) & (columns < width)
-    evidence = np.broadcast_to(inside | (pair.outside is None), low.shape)
+    evidence = np.broadcast_to(inside | (pair.border_share is None), low.shape)
     if pair.right_bad is not None:
         evidence = evidence & ~pair.right_bad[:, np.clip(columns, 0, width - 1)]
     low[...] = np.where(evidence, 0, border_cost)

@@ -46,7 +46,7 @@ class DevicePair:
         Size of an image, pixels.
     levels : Levels
         Disparities to try.
-    outside : float or None
+    border_share : float or None
     ranges : ((int, int), (int, int)) or None
         As of `stereokit.costs.rows.Pair`.
     """
@@ -58,7 +58,7 @@ class DevicePair:
     height: int
     width: int
     levels: Levels
-    outside: float | None
+    border_share: float | None
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
 
     @property
@@ -73,8 +73,8 @@ class DevicePair:
 
     def evidence(self, cost_max: int) -> tuple[Any, ...]:
         """Return the last arguments of a cost's kernel, of the types `EVIDENCE`."""
-        border_cost = cost_max if self.outside is None else round(self.outside * cost_max)
-        clamp_border = int(self.outside is None)
+        border_cost = cost_max if self.border_share is None else round(self.border_share * cost_max)
+        clamp_border = int(self.border_share is None)
         size = self.height, self.width, self.padded // 4
         return self.bad, *size, self.levels.count, self.levels.minimum, border_cost, clamp_border
 

@@ -195,7 +195,7 @@ class CudaPipeline:
         left, right : (H, W) or (H, W, 3) uint8, C-contiguous, with ``__cuda_array_interface__``
             Grey or RGB; not modified.
         stream : stream of numba, PyTorch or CuPy, int, or None
-            Stream of the launches; None is the default stream, which waits for all others unless they were made otherwise.
+            Stream of the launches; None is the default stream, which waits for all others but non-blocking ones.
 
         Raises
         ------

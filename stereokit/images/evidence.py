@@ -1,9 +1,9 @@
 """Which pixels have something to say: masks of the user, black borders, and areas without texture.
 
 Pixels **without evidence** are those that a mask excludes, that hold no data, or that lie in a black border. They match
-nothing, are never measured and are not filled. **Blank** pixels are those of the left view in whose surroundings, as far
-as the cost looks, all pixels are equal: their cost is the same at all disparities, so that their neighbours decide on
-the value that they get, and they do not count as measured.
+nothing, are never measured and are not filled. **Blank** pixels are those of the left view in whose surroundings, as
+far as the cost looks, all pixels are equal: their cost is the same at all disparities, so that their neighbours decide
+on the value that they get, and they do not count as measured.
 
 A black border is what rectification leaves where no camera looked: zeros that hang together and reach a side of the
 image, at least `_SMALLEST_BORDER` of them and mostly thick. Of 224 views of streets, rooms and fields none has one.
@@ -86,19 +86,20 @@ def black_border(image: NDArray[Any]) -> NDArray[np.bool_] | None:
     if not any((side == 0).all(axis=-1).any() for side in (colors[0], colors[-1], colors[:, 0], colors[:, -1])):
         return None
     zero = np.ascontiguousarray((colors == 0).all(axis=-1)).view(np.uint8)
-    _, labels, found, _ = cv2.connectedComponentsWithStats(zero, connectivity=4)
-    at = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    at = at[(at > 0) & (found[at, cv2.CC_STAT_AREA] >= _SMALLEST_BORDER)]
-    if not at.size:
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(zero, connectivity=4)
+    borders = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    borders = borders[(borders > 0) & (statistics[borders, cv2.CC_STAT_AREA] >= _SMALLEST_BORDER)]
+    if not borders.size:
         return None
     inner = cv2.erode(zero, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    inside = np.bincount(labels[inner > 0], minlength=len(found))
-    at = at[inside[at] >= _THICK * found[at, cv2.CC_STAT_AREA]]
-    if not at.size or found[at, cv2.CC_STAT_AREA].sum() == zero.size:  # an image that is black altogether has no border
+    inside = np.bincount(labels[inner > 0], minlength=len(statistics))
+    borders = borders[inside[borders] >= _THICK * statistics[borders, cv2.CC_STAT_AREA]]
+    if not borders.size or statistics[borders, cv2.CC_STAT_AREA].sum() == zero.size:  # a black image has no border
         return None
-    chosen = np.zeros(len(found), np.bool_)
-    chosen[at] = True
-    return chosen[labels]
+    is_border = np.zeros(len(statistics), np.bool_)
+    is_border[borders] = True
+    border: NDArray[np.bool_] = is_border[labels]
+    return border
 
 
 def blank_pixels(gray: NDArray[Any], across: int, down: int) -> NDArray[np.bool_] | None:

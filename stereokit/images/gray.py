@@ -84,8 +84,8 @@ def gray_pair(left: Any, right: Any, nodata: float | None = None, mask: Any = No
     images = checked_image("left", left), checked_image("right", right)
     check_same(*images, *(getattr(image, "dtype", None) for image in (left, right)))
     excluded = [
-        joined(unusable(checked_mask(name, given, image.shape)), black_border(image))
-        for name, given, image in zip(("mask", "right_mask"), (mask, right_mask), images, strict=True)
+        joined(unusable(checked_mask(name, user_mask, image.shape)), black_border(image))
+        for name, user_mask, image in zip(("mask", "right_mask"), (mask, right_mask), images, strict=True)
     ]
     plain = [image if bad is None else neutral(image, ~bad) for image, bad in zip(images, excluded, strict=True)]
     mapping = find_mapping(lambda: [(0, image) for image in plain], plain[0].dtype, plain[0].shape, nodata)

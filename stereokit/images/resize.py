@@ -79,8 +79,15 @@ def half_size(pair: GrayPair) -> GrayPair:
 
     left, right = shrink(pair.left), shrink(pair.right)
     guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
-    masks = {name: _half_mask(getattr(pair, name)) for name in ("left_bad", "right_bad", "left_blank")}
-    return replace(pair, left=left, right=right, guide=guide, **masks)
+    return replace(
+        pair,
+        left=left,
+        right=right,
+        guide=guide,
+        left_bad=_half_mask(pair.left_bad),
+        right_bad=_half_mask(pair.right_bad),
+        left_blank=_half_mask(pair.left_blank),
+    )
 
 
 def reduced_mask(mask: NDArray[np.bool_] | None, step: int) -> NDArray[np.bool_] | None:

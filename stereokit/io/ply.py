@@ -16,7 +16,9 @@ __all__ = [
 ]
 
 
-def write_ply(path: str | os.PathLike[str], points: ArrayLike, colors: ArrayLike | None = None) -> None:
+def write_ply(
+    path: str | os.PathLike[str], points: ArrayLike, colors: ArrayLike | None = None, comment: str | None = None
+) -> None:
     """Write a point cloud as binary little-endian PLY.
 
     Parameters
@@ -27,6 +29,8 @@ def write_ply(path: str | os.PathLike[str], points: ArrayLike, colors: ArrayLike
         Metres, finite; stored as float32.
     colors : (N, 3) uint8, optional
         RGB of each point.
+    comment : str, optional
+        A line of the header, ASCII: what the axes are, for instance.
 
     Raises
     ------
@@ -50,6 +54,11 @@ def write_ply(path: str | os.PathLike[str], points: ArrayLike, colors: ArrayLike
     vertices = np.empty(len(xyz), dtype=fields)
     for k, (name, _) in enumerate(fields):
         vertices[name] = xyz[:, k] if k < 3 else rgb[:, k - 3]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if comment is not None:
+        if not (comment.isascii() and comment.isprintable()):
+            raise InputError(f"comment must be one line of ASCII, got {comment!r}")
+        lines.append(f"comment {comment}")
+    lines += [f"element vertex {len(xyz)}"]
     lines += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in fields]
     write_bytes(target, "\n".join([*lines, "end_header", ""]).encode("ascii") + vertices.tobytes())

@@ -13,12 +13,15 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import cv2
 
 __all__ = ["keep_stderr", "quiet_decoders"]
 
 _STDERR = 2
+_SILENT = 0
+_log: Any = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging  # as OpenCV 4, and OpenCV 5, have it
 _lock = threading.Lock()
 _decoder_count = 0  # threads that decode
 _saved_state: tuple[int, int | None] = (0, None)  # OpenCV's level; a copy of the descriptor if it is redirected
@@ -47,8 +50,8 @@ def quiet_decoders() -> Iterator[None]:
     global _decoder_count, _saved_state
     with _lock:
         if _decoder_count == 0:
-            level = cv2.utils.logging.getLogLevel()
-            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            level = _log.getLogLevel()
+            _log.setLogLevel(_SILENT)
             _saved_state = level, _redirect_stderr() if _can_redirect() else None
         _decoder_count += 1
     try:
@@ -58,7 +61,7 @@ def quiet_decoders() -> Iterator[None]:
             _decoder_count -= 1
             if _decoder_count == 0:
                 level, descriptor = _saved_state
-                cv2.utils.logging.setLogLevel(level)
+                _log.setLogLevel(level)
                 if descriptor is not None:
                     os.dup2(descriptor, _STDERR)
                     os.close(descriptor)

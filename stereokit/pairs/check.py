@@ -1,4 +1,4 @@
-"""A pair is looked at before it is matched: is it rectified, left and right, and within the range that is searched?
+"""A look at a pair before it is matched: whether it is rectified, left and right, and within the searched range.
 
 Features that both views show tell (`stereokit.pairs.features`): in a rectified pair they lie on the same rows, and the
 right view has them further to the left, by the disparities. What else can be told by the pixels alone, such as blank
@@ -36,7 +36,7 @@ KINDS = {
     "blank": "much of the left view has no texture",
     "saturated": "much of the left view is white",
 }
-"""What can be wrong with a pair, the worst first. Up to "unrelated" no useful map can be expected, or much of it lacks."""
+"""What can be wrong with a pair, the worst first; up to "unrelated" the map suffers."""
 
 SERIOUS = frozenset(("same", "exchanged", "mirrored", "rotated", "rows", "range", "unrelated"))
 
@@ -46,7 +46,7 @@ _TOLERANCE = 1.0  # of rows, pixels of the image that is looked at
 _MAJORITY = 0.5  # of the points that agree
 _STILL = 0.25  # pixels of disparity that no point of a picture given twice has
 _OFFSET, _ROLL, _SCALE = 0.6, 0.15, 0.007  # pixels, degrees, a share: beyond these rows do not meet
-_ERRORS = 3.0  # standard errors that are added to those
+_ERRORS = 4.0  # standard errors that are added to those
 _TURN, _TURN_SPREAD = 8.0, 12.0  # degrees
 _INSIDE, _OUTSIDE = 0.2, 0.8  # shares of the points that lie in the range, and would if the views were exchanged
 _CLIPPED, _FEWEST_CLIPPED, _SLACK = 0.03, 6, 1.5  # share, points and pixels beyond an end of the range
@@ -54,7 +54,7 @@ _FEW = 0.15  # of the features, that agree where both views are of one scene and
 _LARGE_ROLL = 1.0  # degrees beyond which disparities are not what they will be
 _MANY = 150  # features of either view that two views of one scene have many of in common
 _FEW_AGREE, _FEW_MATCHES = 0.25, 0.04
-_BRIGHTER, _SHARPER = 1.5, 1.4
+_BRIGHTER, _SHARPER, _BLURRED = 1.5, 1.4, 2.5
 _BLANK, _WHITE = 0.5, 0.3
 _PATCH = 7  # side of the patch whose brightness is compared, pixels
 
@@ -196,10 +196,12 @@ def check_gray(pair: GrayPair, min_disparity: int, max_disparity: int, *, quick:
             faults = _of_rows(known, height, width)
             if abs(known.roll_degrees) < _LARGE_ROLL:
                 faults += _of_disparities(matches, known, min_disparity, max_disparity)
+    blank, white = _blank(left), _saturated(pair.left)
+    sharpness = _sharpness(right) / _sharpness(left)
+    if known is None and faults and not 1 / _BLURRED < sharpness < _BLURRED:
+        faults = []  # features of so different views tell nothing
     places = (matches.left[known.agreeing], matches.right[known.agreeing]) if known is not None else None
     brightness = _brightness(pair, places)
-    sharpness = _sharpness(right) / _sharpness(left)
-    blank, white = _blank(left), _saturated(pair.left)
     faults += _of_light(brightness, sharpness if not faults or known is not None else 1.0, blank, white)
     order = list(KINDS)
     faults.sort(key=lambda fault: order.index(fault.kind))
@@ -231,17 +233,16 @@ def _usable(bad: NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np
     if bad is None:
         return None
     wide = cv2.dilate(bad.view(np.uint8), np.ones((9, 9), np.uint8))
-    return np.asarray(cv2.resize(wide, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)) == 0
+    small = np.asarray(cv2.resize(wide, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST))
+    return np.asarray(small == 0)
 
 
 def _of_rows(rows: Rows, height: int, width: int) -> list[Fault]:
     """Return what is wrong with rows that are known."""
-    count = math.sqrt(rows.agreeing.sum())
-    error = _ERRORS * rows.spread / count
-    tilt = math.sqrt(12)  # the spread of what is even from one side to the other is its width over this
-    offset = abs(rows.offset) > _OFFSET + error
-    roll = abs(rows.roll_degrees) > _ROLL + math.degrees(error * tilt / width)
-    scale = abs(rows.scale) > _SCALE + error * tilt / height
+    of_offset, of_roll, of_scale = (_ERRORS * error for error in rows.errors)
+    offset = abs(rows.offset) > _OFFSET + of_offset
+    roll = abs(rows.roll_degrees) > _ROLL + math.degrees(of_roll)
+    scale = abs(rows.scale) > _SCALE + of_scale
     if not (offset or roll or scale):
         return []
     side = "lower" if rows.offset > 0 else "higher"
@@ -261,7 +262,7 @@ def _of_rows(rows: Rows, height: int, width: int) -> list[Fault]:
 def _of_disparities(matches: Matches, rows: Rows, low: int, high: int) -> list[Fault]:
     """Return what is wrong with the disparities of the points that agree."""
     across = (matches.left - matches.right)[rows.agreeing, 0]
-    if np.percentile(np.abs(across), 90) < _STILL:
+    if np.percentile(np.abs(across), 80) < _STILL:
         return [_fault("same", "left and right show the same picture, without any parallax: was one view given twice?")]
 
     def inside(values: NDArray[np.float64]) -> float:
@@ -271,8 +272,8 @@ def _of_disparities(matches: Matches, rows: Rows, low: int, high: int) -> list[F
         return [
             _fault(
                 "exchanged",
-                f"the views look exchanged (or both are upside down): {100 * np.mean(across < 0):.0f} % of {across.size} "
-                "common points lie further to the right in the right view; give the views the other way round",
+                f"the views look exchanged (or both are upside down): {100 * np.mean(across < 0):.0f} % of "
+                f"{across.size} common points lie further right in the right view; give the views the other way round",
             )
         ]
     ends = []
@@ -365,6 +366,8 @@ def _brightness(pair: GrayPair, places: tuple[NDArray[np.float64], NDArray[np.fl
 
 def _sharpness(image: NDArray[np.uint8]) -> float:
     """Return how much of an image's slopes is of the finest scale: the energy of its Laplacian over its gradient's."""
+    if min(image.shape) < 3:
+        return 1.0
     soft = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
     slopes = float(np.square(np.diff(soft, axis=0)).mean() + np.square(np.diff(soft, axis=1)).mean())
     return float(np.square(cv2.Laplacian(soft, cv2.CV_32F)).mean()) / max(slopes, 1e-6) + 1e-6

@@ -73,14 +73,18 @@ def stretched(image: NDArray[Any], side: int) -> tuple[NDArray[np.uint8], float]
     return np.clip(levels, 0, 255).astype(np.uint8), factor
 
 
+def _sift(count: int, contrast: float) -> Any:
+    return cv2.SIFT_create(count, contrastThreshold=contrast)  # type: ignore[attr-defined]
+
+
 def points_of(image: NDArray[np.uint8], factor: float, usable: NDArray[np.bool_] | None = None) -> Points:
     """Return the features of an image that was shrunk by `factor`; none of pixels that are not `usable`."""
     mask = None if usable is None else usable.astype(np.uint8)
-    found, words = cv2.SIFT_create(_COUNT, contrastThreshold=_CONTRAST).detectAndCompute(image, mask)
+    keypoints, words = _sift(_COUNT, _CONTRAST).detectAndCompute(image, mask)
     if words is None:
         return Points(np.empty((0, 2)), np.empty(0), np.empty((0, 128), np.float32))
-    places = (np.array([point.pt for point in found]) + 0.5) / factor - 0.5
-    return Points(places, np.array([point.angle for point in found]), words)
+    places = (np.array([point.pt for point in keypoints]) + 0.5) / factor - 0.5
+    return Points(places, np.array([point.angle for point in keypoints]), words)
 
 
 def match_points(left: Points, right: Points) -> Matches:

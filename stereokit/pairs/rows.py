@@ -39,6 +39,8 @@ class Rows:
         Which do.
     spread : float
         Standard deviation of those from the fit, pixels.
+    errors : (float, float, float)
+        Standard errors of `offset`, `roll` and `scale`, which are large where the points lie close together.
     """
 
     offset: float
@@ -47,6 +49,7 @@ class Rows:
     share: float
     agreeing: NDArray[np.bool_]
     spread: float
+    errors: tuple[float, float, float]
 
     @property
     def roll_degrees(self) -> float:
@@ -80,12 +83,12 @@ def fit_rows(matches: Matches, height: int, width: int, tolerance: float) -> Row
     regular = np.abs(np.linalg.det(systems)) > 1e-6 * height * width
     if not regular.any():
         return None
-    found = np.linalg.solve(systems[regular], off[triples[regular]][:, :, None])[:, :, 0]
-    found = found[np.abs(found[:, 1:]).max(axis=1) < _STEEPEST]
-    if not len(found):
+    models = np.linalg.solve(systems[regular], off[triples[regular]][:, :, None])[:, :, 0]
+    models = models[np.abs(models[:, 1:]).max(axis=1) < _STEEPEST]
+    if not len(models):
         return None
-    votes = (np.abs(found @ terms.T - off) < tolerance).sum(axis=1)
-    best = found[votes.argmax()]
+    votes = (np.abs(models @ terms.T - off) < tolerance).sum(axis=1)
+    best = models[votes.argmax()]
     for _ in range(_ROUNDS):
         agreeing = np.abs(terms @ best - off) < tolerance
         if agreeing.sum() < 3:
@@ -96,4 +99,9 @@ def fit_rows(matches: Matches, height: int, width: int, tolerance: float) -> Row
     if agreeing.sum() < FEWEST:
         return None
     offset, roll, scale = (float(value) for value in best)
-    return Rows(offset, roll, scale, float(agreeing.mean()), agreeing, float(error[agreeing].std()))
+    spread = float(error[agreeing].std())
+    normal = terms[agreeing].T @ terms[agreeing]
+    if np.linalg.cond(normal) > 1e12:  # all on a line
+        return None
+    errors = spread * np.sqrt(np.diag(np.linalg.inv(normal)))
+    return Rows(offset, roll, scale, float(agreeing.mean()), agreeing, spread, (*map(float, errors),))  # type: ignore[arg-type]

@@ -1,8 +1,8 @@
 """Calibration boards, and their corners in images.
 
 A chessboard is found by ``cv2.findChessboardCornersSB`` (Duda and Frese, Accurate detection and localization of
-checkerboard corners for calibration, 2018) or ``cv2.findChessboardCorners``, a ChArUco board by ``cv2.aruco.CharucoDetector`` (Garrido-Jurado and others
-2014), of which any part may be hidden.
+checkerboard corners for calibration, 2018) or ``cv2.findChessboardCorners``, a ChArUco board by
+``cv2.aruco.CharucoDetector`` (Garrido-Jurado and others 2014), of which any part may be hidden.
 """
 
 from __future__ import annotations

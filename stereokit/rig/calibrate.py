@@ -134,7 +134,10 @@ def calibrate(
         views, lens = _without_outliers(views, lambda some, side=side: solver.alone(some, side))
         _demand(views, qualities, board)
         lenses.append(lens)
-    views, (lenses, rotation, translation) = _without_outliers(views, lambda some: solver.together(some, lenses))
+    # With the lenses as they are first: free ones bend to what a single wrong pair says.
+    views, _ = _without_outliers(views, lambda some: solver.together(some, lenses, True))
+    _demand(views, qualities, board)
+    views, (lenses, rotation, translation) = _without_outliers(views, lambda some: solver.together(some, lenses, False))
     _demand(views, qualities, board)
     left, right = (Camera(k, d, model, *size) for k, d in lenses)
     rig = StereoRig(left, right, rotation, translation)
@@ -250,6 +253,7 @@ def _without_outliers(views: list[_View], solve: Any) -> tuple[list[_View], Any]
         middle = f"{np.median(errors):.2f}"
         for view, error in zip(views, errors, strict=True):
             if error > limit:
+                view.quality.reprojection_px = float(error)
                 view.quality.reason = f"disagrees with the others: reprojection error {error:.1f} px, median {middle}"
         views = [view for view in views if not view.quality.reason]
     for view, error in zip(views, errors, strict=True):
@@ -279,16 +283,16 @@ class _Pinhole:
         return np.ravel(np.asarray(errors, np.float64)), (np.asarray(k, np.float64), self._trimmed(d))
 
     def together(
-        self, views: Sequence[_View], lenses: Sequence[tuple[Array, Array]]
+        self, views: Sequence[_View], lenses: Sequence[tuple[Array, Array]], fixed: bool
     ) -> tuple[Array, tuple[list[tuple[Array, Array]], Array, Array]]:
-        """Return the error of each pair, and the two cameras with their pose."""
+        """Return the error of each pair, and the two cameras with their pose; with `fixed` the lenses stay."""
         points, left = _lists(views, 0)
         _, right = _lists(views, 1)
         (k1, d1), (k2, d2) = lenses
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-7)
         done = cv2.stereoCalibrateExtended(
             points, left, right, k1.copy(), d1.copy(), k2.copy(), d2.copy(), self.size, np.eye(3), np.zeros((3, 1)),
-            flags=self.flags | cv2.CALIB_USE_INTRINSIC_GUESS, criteria=criteria,
+            flags=self.flags | (cv2.CALIB_FIX_INTRINSIC if fixed else cv2.CALIB_USE_INTRINSIC_GUESS), criteria=criteria,
         )  # fmt: skip
         k1, d1, k2, d2, rotation, translation = (np.asarray(one, np.float64) for one in done[1:7])
         each = np.asarray(done[-1], np.float64).reshape(len(views), 2)
@@ -327,9 +331,9 @@ class _Fisheye:
         return np.array(errors), (k, d)
 
     def together(
-        self, views: Sequence[_View], lenses: Sequence[tuple[Array, Array]]
+        self, views: Sequence[_View], lenses: Sequence[tuple[Array, Array]], fixed: bool
     ) -> tuple[Array, tuple[list[tuple[Array, Array]], Array, Array]]:
-        """Return the error of each pair, and the two cameras with their pose; the lenses stay as they are."""
+        """Return the error of each pair, and the two cameras with their pose; the lenses always stay."""
         points, left = self._lists(views, 0)
         _, right = self._lists(views, 1)
         (k1, d1), (k2, d2) = lenses
@@ -402,7 +406,7 @@ def _rms(rest: Array) -> float:
 
 def _graded(rig: StereoRig, views: Sequence[_View], qualities: list[PairQuality]) -> BoardCalibration:
     """Return the rig with all that tells how good it is."""
-    rectified = _rectification(rig)
+    rectified = rectification_of(rig)
     rows = []
     for view in views:
         left, right = (rectified_pixels(rig, rectified, side, view.pixels[side]) for side in (0, 1))
@@ -438,7 +442,8 @@ def _graded(rig: StereoRig, views: Sequence[_View], qualities: list[PairQuality]
     )
 
 
-def _rectification(rig: StereoRig) -> Rectification:
+def rectification_of(rig: StereoRig) -> Rectification:
+    """Return the rectification of a rig; for a very wide lens that at the focal length of the raw one."""
     try:
         return rig.rectification()
     except OptionError:  # a very wide lens
@@ -454,9 +459,16 @@ def rectified_pixels(rig: StereoRig, rectified: Rectification, side: int, pixels
         flat = cv2.fisheye.undistortPoints(points, camera.matrix, camera.distortion, R=turn, P=projection)
     else:
         distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-        flat = cv2.undistortPoints(points, camera.matrix, distortion, None, turn, projection, criteria)
+        flat = _undistorted(points, camera.matrix, distortion, turn, projection)
     return np.asarray(flat, np.float64).reshape(-1, 2)
+
+
+def _undistorted(points: Array, camera: Array, distortion: Array, turn: Array, projection: Array) -> Any:
+    """Return points without distortion, with as many iterations as it takes: five are too few at the sides."""
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+        return cv2.undistortPointsIter(points, camera, distortion, turn, projection, criteria)
+    return cv2.undistortPoints(points, camera, distortion, None, turn, projection, criteria)
 
 
 def _coverage(pixels: Sequence[Array], size: tuple[int, int]) -> float:
@@ -487,7 +499,8 @@ def directions(camera: Camera, pixels: Array) -> Array:
     if camera.model == "fisheye":
         flat = cv2.fisheye.undistortPoints(points, camera.matrix, camera.distortion)
     else:
-        flat = cv2.undistortPoints(points, camera.matrix, camera.distortion if len(camera.distortion) else np.zeros(5))
+        distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
+        flat = _undistorted(points, camera.matrix, distortion, np.eye(3), np.eye(3))
     return np.asarray(flat, np.float64).reshape(-1, 2)
 
 

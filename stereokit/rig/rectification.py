@@ -74,6 +74,12 @@ class Rectification:
         """Width and height of the rectified images, pixels."""
         return self.mask.shape[1], self.mask.shape[0]
 
+    @property
+    def masks(self) -> dict[str, NDArray[np.bool_]]:
+        """Arguments of `stereokit.Matcher` that leave out what no sensor saw: ``matcher(left, right, **masks)``."""
+        masks = {"mask": self.mask, "right_mask": self.right_mask}
+        return {name: mask for name, mask in masks.items() if not mask.all()}
+
     def __call__(self, left: ArrayLike, right: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the rectified images of a raw pair, of the same types; 0 where the sensors saw nothing.
 

@@ -31,7 +31,7 @@ def counts(run_python, tmp_path_factory):
     folder = tmp_path_factory.mktemp("arm")
     # Caches of their own: what comes out of a cache has no assembly, and its inner kernels no signatures.
     cache = {"NUMBA_CACHE_DIR": str(folder / "cache")}
-    run_python(HERE / "cross.py", "record", folder / "signatures", **cache)
+    run_python(HERE / "cross.py", "record", folder / "signatures", NUMBA_OPT="0", **cache)  # types are all we want
     cache = {"NUMBA_CACHE_DIR": str(folder / "cross-cache")}
     run_python(HERE / "cross.py", "count", folder / "signatures", folder / "counts.json", **cache)
     table = json.loads((folder / "counts.json").read_text(encoding="utf-8"))

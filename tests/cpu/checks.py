@@ -158,9 +158,10 @@ def check_edges():
 
 
 def check_many_levels():
-    """Compare two blocks of levels, the second of them full or not."""
-    for count in (70, 128):
-        check_paths((3, 4), count, 9, 193, 8)
+    """Compare two, three and eight blocks of levels, the last of them full or not."""
+    for count in (70, 128, 130, 512):
+        for p1, p2 in ((9, 60), (9, 193)):  # sums of bytes and of words
+            check_paths((3, 4), count, p1, p2, 8)
 
 
 def check_tall():
@@ -170,8 +171,9 @@ def check_tall():
 
 def check_recovered():
     """Compare costs that the second sweep takes back from path costs."""
-    for count in (5, 70):
-        check_paths((5, 4), count, paths=4, recovers=True, edge_factor=0.5)
+    for count in (5, 70, 130):
+        for largest, p2 in ((62, 60), (31, 224), (254, 1)):
+            check_paths((5, 4), count, p2 // 3, p2, 4, largest=largest, recovers=True, edge_factor=0.5)
 
 
 def check_bytes():
@@ -185,7 +187,9 @@ def check_bytes():
 def check_largest():
     """Compare under the largest penalties that a byte leaves."""
     for pattern in PATTERNS:
-        check_paths((3, 4), 9, 60, 193, 8, pattern)
+        for count in (9, 130):
+            for largest in (1, 62, 127, 254):
+                check_paths((3, 4), count, (255 - largest) // 2, 255 - largest, 8, pattern, largest)
 
 
 def check_close_penalties():

@@ -80,8 +80,8 @@ def wait_for(condition, process=None, seconds=HANG_S):
 
 def inodes(folder, suffix=".png"):
     """Return what tells one written file from another."""
-    found = {}
+    numbers = {}
     for path in folder.glob(f"*{suffix}"):
         state = path.stat()
-        found[path.name] = state.st_ino, state.st_mtime_ns
-    return found
+        numbers[path.name] = state.st_ino, state.st_mtime_ns
+    return numbers

@@ -23,9 +23,9 @@ from stereokit.io import read_disparity, write_image
 from stereokit_evaluation.batch import job as batch_job
 from stereokit_evaluation.batch import run as batch_run
 from stereokit_evaluation.batch.job import Job, Outcome
-from stereokit_evaluation.batch.pairs import Pair, folder_pairs, list_pairs
+from stereokit_evaluation.batch.pairs import PairFiles, folder_pairs, list_pairs
 from stereokit_evaluation.batch.run import Summary, on_threads, run_batch
-from stereokit_evaluation.batch.store import held, publish
+from stereokit_evaluation.batch.store import open_output, publish
 from stereokit_evaluation.batch.video import Video
 from stereokit_evaluation.commands.batch import find_pairs
 
@@ -137,14 +137,14 @@ def test_the_work_of_listing_pairs_grows_with_their_number_and_no_faster(tmp_pat
     def calls(count):
         path = tmp_path / f"{count}.csv"
         path.write_text("".join(f"left/{k:06d}.png,right/{k:06d}.png\n" for k in range(count)), encoding="utf-8")
-        made = Counter()
-        sys.setprofile(lambda frame, event, argument: made.update([event]))
+        counts = Counter()
+        sys.setprofile(lambda frame, event, argument: counts.update([event]))
         try:
             pairs = list_pairs(path)
         finally:
             sys.setprofile(None)
         assert len(pairs) == count
-        return made.total()
+        return counts.total()
 
     few, many = calls(1000), calls(2000)
     assert many < 2.05 * few and few < 200 * 1000
@@ -173,8 +173,8 @@ def test_maps_are_those_of_match(tmp_path):
 def test_formats(suffix, tmp_path):
     write_pairs(tmp_path, ["0"])
     run(tmp_path, "-o", tmp_path / "out", "--format", suffix)
-    found = read_disparity(tmp_path / "out" / f"0.{suffix}")
-    np.testing.assert_allclose(found, stereokit.match(*images(0), "S2", max_disparity=16), atol=1 / 256)
+    disparity = read_disparity(tmp_path / "out" / f"0.{suffix}")
+    np.testing.assert_allclose(disparity, stereokit.match(*images(0), "S2", max_disparity=16), atol=1 / 256)
 
 
 def test_names_with_folders(tmp_path):
@@ -251,7 +251,7 @@ def test_an_output_that_cannot_be_is_refused(tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="folders are not locked on Windows")
 def test_two_runs_do_not_share_a_folder(tmp_path):
     write_pairs(tmp_path, ["0"])
-    with held(tmp_path / "out", {}, ".png", str.isdigit, False):
+    with open_output(tmp_path / "out", {}, ".png", str.isdigit, False):
         assert "another run" in refused(tmp_path, "-o", tmp_path / "out")
 
 
@@ -311,7 +311,7 @@ def test_few_pairs_are_held_at_a_time(tmp_path, monkeypatch):
         nonlocal taken
         for k in range(200):
             taken += 1
-            yield Pair(str(k), "", "")
+            yield PairFiles(str(k), "", "")
 
     monkeypatch.setattr(batch_run, "work", lambda job, name, left, right: Outcome(name, True))
     job = Job(str(tmp_path), ".png", False, "S2", (("max_disparity", 16),))
@@ -381,8 +381,8 @@ def test_a_video_side_by_side_and_in_two_files(tmp_path):
         summary = run(*inputs, "-o", out)
         assert (summary["written"], summary["failed"]) == (5, 0)
         for k in range(5):
-            found = read_disparity(out / f"{k:06d}.png")
-            assert np.median(found) == pytest.approx(4 + k, abs=0.5)
+            disparity = read_disparity(out / f"{k:06d}.png")
+            assert np.median(disparity) == pytest.approx(4 + k, abs=0.5)
         (out / "000002.png").unlink()
         before = inodes(out)
         assert run(*inputs, "-o", out)["written"] == 1
@@ -414,7 +414,7 @@ def test_the_function_takes_any_engine(tmp_path):
 
     seen = []
     summary = run_batch(
-        job, [Pair(name, "", "") for name in "abc"], engine, inputs="x", progress=lambda s: seen.append(s.pairs)
+        job, [PairFiles(name, "", "") for name in "abc"], engine, inputs="x", progress=lambda s: seen.append(s.pairs)
     )
     assert isinstance(summary, Summary) and seen == [1, 2, 3]
     assert (summary.written, summary.failed, summary.errors) == (2, 1, [("b", "broken")])
@@ -457,18 +457,18 @@ def listed(folder, *files):
     ],
 )  # fmt: skip
 def test_names_of_pairs(files, names, tmp_path):
-    found = listed(tmp_path, *files)
-    assert sorted(found) == names
-    assert sorted(side for pair in found.values() for side in pair) == sorted(f for f in files if "." in f and
+    pairs = listed(tmp_path, *files)
+    assert sorted(pairs) == names
+    assert sorted(side for pair in pairs.values() for side in pair) == sorted(f for f in files if "." in f and
            not f.endswith((".txt", ".yaml")) and not (f.endswith(".npy") and "/" in f)
            and not ("venus" in f and f[-5] in "01"))  # fmt: skip
     if "venus/im2.ppm" in files:
-        assert found["venus"] == ("venus/im2.ppm", "venus/im6.ppm")
+        assert pairs["venus"] == ("venus/im2.ppm", "venus/im6.ppm")
 
 
 def test_a_view_that_is_missing_is_told_where_the_name_is_sure(tmp_path):
-    found = listed(tmp_path, "a_left.png", "a_right.png", "b_left.png", "r2.png")
-    assert sorted(found) == ["a", "b"] and os.path.basename(found["b"][1]) == "b_right.png"
+    pairs = listed(tmp_path, "a_left.png", "a_right.png", "b_left.png", "r2.png")
+    assert sorted(pairs) == ["a", "b"] and os.path.basename(pairs["b"][1]) == "b_right.png"
 
 
 def test_a_folder_without_pairs_says_what_is_known_and_how_to_tell_more(tmp_path):

@@ -116,8 +116,8 @@ def test_a_scheduler_that_dies_ends_the_batch_with_one_line(tmp_path):
         wait_for(lambda: len(inodes(out)) >= 3, process)
         scheduler.kill()
         assert process.wait(HANG_S) == 2
-    told = [line for line in (tmp_path / "stderr").read_text().splitlines() if line.startswith("error: ")]
-    assert len(told) == 1 and "the Dask scheduler was lost" in told[0]
+    errors = [line for line in (tmp_path / "stderr").read_text().splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and "the Dask scheduler was lost" in errors[0]
     before = inodes(out)
     assert 3 <= len(before) < COUNT
     again = run(tmp_path, "-o", out)

@@ -36,7 +36,7 @@ def chromium():
     """Return a running headless browser, or skip."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
-    path = next((found for name in names if (found := shutil.which(name))), None)
+    path = next((program for name in names if (program := shutil.which(name))), None)
     if path is None:
         pytest.skip("no Chromium on the PATH")
     with playwright.sync_playwright() as started:
@@ -61,7 +61,7 @@ def study_file(tmp_path_factory):
         patch.setattr(datasets, "_SCENE_SIZE", (320, 192))
         datasets._scene.cache_clear()
         words = ["--count", "3", "--max-disparity", "64", "--threads", "1", "--repeats", "1", "--no-peers"]
-        words += ["--setting", "linear", "--setting", "original", "-o", str(out)]
+        words += ["--variant", "linear", "--variant", "original", "-o", str(out)]
         done = CliRunner().invoke(app, words)
     datasets._scene.cache_clear()
     assert done.exit_code == 0, (done.output, done.exception)
@@ -76,12 +76,12 @@ def small_pair():
     valid[:, :20] = False
     truth = np.full(shape, 10, np.float32)
     truth[:, 100:] = 16
-    seen = truth.copy()
-    seen[20:] = np.nan
+    visible = truth.copy()
+    visible[20:] = np.nan
     ten, twelve = (np.full(shape, value, np.float32) for value in (10, 12.5))
-    maps = [viewer.Shown("ten", ten, valid), viewer.Shown("twelve", twelve, np.ones(shape, bool))]
+    maps = [viewer.MethodMap("ten", ten, valid), viewer.MethodMap("twelve", twelve, np.ones(shape, bool))]
     camera = Calibration(fx=100, fy=100, cx0=60, cy=20, baseline_m=0.5)
-    return viewer.pair("known", image, maps, noc=seen, occ=truth, calibration=camera), maps
+    return viewer.pair("known", image, maps, noc=visible, occ=truth, calibration=camera), maps
 
 
 @pytest.fixture(scope="module")
@@ -99,10 +99,10 @@ def opened(chromium, path, size="desktop", scheme="light"):
     """Open a page in a fresh profile without a network; it must say nothing on the console and ask for nothing."""
     width, height = SIZES[size]
     context = chromium.new_context(viewport={"width": width, "height": height}, color_scheme=scheme, offline=True)
-    page, said, asked = context.new_page(), [], []
-    page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url[:60]))
+    page, messages, requests = context.new_page(), [], []
+    page.on("console", lambda message: messages.append(message.text) if message.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url[:60]))
     page.goto(path.as_uri())
     page.wait_for_selector("#viewer[data-ready]", timeout=1000 * HANG_S)
     if page.query_selector("#charts"):
@@ -112,8 +112,8 @@ def opened(chromium, path, size="desktop", scheme="light"):
         Path(folder).mkdir(parents=True, exist_ok=True)
         page.screenshot(path=f"{folder}/{path.stem}-{size}-{scheme}.png", full_page=True)
     context.close()
-    assert said == []
-    assert all(url.startswith(("file:", "data:", "blob:")) for url in asked)
+    assert messages == []
+    assert all(url.startswith(("file:", "data:", "blob:")) for url in requests)
 
 
 def pixels(page, canvas):
@@ -248,13 +248,13 @@ def test_errors_have_the_colours_of_the_benchmark(chromium, view_file):
         pair, maps = small_pair()
         truth = np.full((40, 120), 10, np.float32)
         truth[:, 100:] = 16
-        seen = truth.copy()
-        seen[20:] = np.nan
-        wanted = error_map(maps[0].disparity, truth, seen, dilate=False)
+        visible = truth.copy()
+        visible[20:] = np.nan
+        expected = error_map(maps[0].disparity, truth, visible, dilate=False)
         drawn = pixels(page, "view-error")
         away = np.ones((40, 120), bool)
         away[6:34, 45:75] = False  # the cross of the cursor
-        assert (drawn == wanted)[away].all()
+        assert (drawn == expected)[away].all()
         assert pair["top"] == 16
 
 
@@ -289,7 +289,7 @@ def test_everything_has_a_name(chromium, study_file):
 
 
 def test_a_pair_without_truth_and_calibration(chromium, tmp_path):
-    shown = viewer.Shown("only", np.full((40, 120), 8, np.float32), np.ones((40, 120), bool))
+    shown = viewer.MethodMap("only", np.full((40, 120), 8, np.float32), np.ones((40, 120), bool))
     pair = viewer.pair("bare", np.zeros((40, 120), np.uint8), [shown])
     path = tmp_path / "bare.html"
     path.write_bytes(render("view.html.j2", [pair], title="bare", version="0", maps=[shown], methods=["only", "only"]))

@@ -13,7 +13,7 @@ import pytest
 
 from stereokit.errors import FileError, OptionError, UnknownNameError
 from stereokit_evaluation.data import datasets
-from stereokit_evaluation.data.frame import Frame, select
+from stereokit_evaluation.data.frame import Frame, select_frames
 
 DATA = Path(os.environ.get("STEREOKIT_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 NAN = np.nan
@@ -178,18 +178,18 @@ def test_plain_folder(tmp_path, kind, ending):
 
 @pytest.mark.parametrize("name", sorted(datasets.DATASETS))
 def test_a_root_without_frames_says_what_was_expected(tmp_path, name):
-    with pytest.raises(FileError, match=r"root holds no .* frames, got .*; expected ") as caught:
-        datasets.load(name, tmp_path)
+    with pytest.raises(FileError, match=r"root has no .* frames, got .*; expected ") as caught:
+        datasets.load_frames(name, tmp_path)
     assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(FileError, match="root must be a folder, got"):
-        datasets.load(name, tmp_path / "nowhere")
+        datasets.load_frames(name, tmp_path / "nowhere")
     with pytest.raises(OptionError, match=f"root must name the folder of data set '{name}', got none"):
-        datasets.load(name)
+        datasets.load_frames(name)
 
 
 def test_an_unknown_data_set_is_named_with_its_neighbour():
     with pytest.raises(UnknownNameError, match="did you mean 'kitti2015'"):
-        datasets.load("kitti2105", ".")
+        datasets.load_frames("kitti2105", ".")
 
 
 def frames_named(*names):
@@ -210,19 +210,19 @@ def frames_named(*names):
 )
 def test_select_by_number(which, expected):
     frames = frames_named("000000_10", "000003_10", "000010_10", "000034_10")
-    assert [frame.name for frame in select(frames, which)] == expected
+    assert [frame.name for frame in select_frames(frames, which)] == expected
 
 
 def test_select_by_name():
     frames = frames_named("2003/cones", "2003/teddy", "2006/Aloe", "a-b", "scene_004")
-    assert [f.name for f in select(frames, "teddy,2006/Aloe")] == ["2003/teddy", "2006/Aloe"]
-    assert [f.name for f in select(frames, "a-b,4")] == ["a-b", "scene_004"]
+    assert [f.name for f in select_frames(frames, "teddy,2006/Aloe")] == ["2003/teddy", "2006/Aloe"]
+    assert [f.name for f in select_frames(frames, "a-b,4")] == ["a-b", "scene_004"]
 
 
 @pytest.mark.parametrize("which", ["", "1,", "50", "5-3", "-3", "1-", "x", "cones2", "1-2-3", "\u0663"])
 def test_select_refuses_what_matches_nothing(which):
     with pytest.raises(OptionError, match="frames must be"):
-        select(frames_named("000001_10", "000005_10", "cones"), which)
+        select_frames(frames_named("000001_10", "000005_10", "cones"), which)
 
 
 def test_images_from_functions_turn_grey():
@@ -245,9 +245,9 @@ def test_scenes_are_adapted_and_drawn_once(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "stereokit_evaluation.synthetic.scenes", SimpleNamespace(generate=generate))
     datasets._scene.cache_clear()
-    frames = datasets.load("scenes", count=3)
+    frames = datasets.load_frames("scenes", count=3)
     assert [frame.name for frame in frames] == ["scene_000", "scene_001", "scene_002"] and not drawn
-    frame = select(frames, "1")[0]
+    frame = select_frames(frames, "1")[0]
     assert (frame.load_left()[0, 0], frame.load_right()[0, 0], frame.load_occ()[0, 0]) == (1, 2, 6.0)
     assert np.isnan(frame.load_noc()[:, :5]).all() and (frame.load_noc()[:, 5:] == 6.0).all()
     assert drawn == [1]
@@ -256,8 +256,8 @@ def test_scenes_are_adapted_and_drawn_once(monkeypatch):
 
 def test_scenes():
     pytest.importorskip("stereokit_evaluation.synthetic.scenes", exc_type=ImportError)
-    frames = datasets.load("scenes", count=2)
-    assert len(frames) == 2 and [f.name for f in select(frames, "1")] == [frames[1].name]
+    frames = datasets.load_frames("scenes", count=2)
+    assert len(frames) == 2 and [f.name for f in select_frames(frames, "1")] == [frames[1].name]
     frame = frames[1]
     left, right, noc, occ = (
         frame.load_left(gray=True),
@@ -270,7 +270,7 @@ def test_scenes():
     assert np.isfinite(noc).sum() < np.isfinite(occ).sum()
     both = np.isfinite(noc)
     np.testing.assert_array_equal(noc[both], occ[both])
-    np.testing.assert_array_equal(left, datasets.load("scenes", count=2)[1].load_left(gray=True))
+    np.testing.assert_array_equal(left, datasets.load_frames("scenes", count=2)[1].load_left(gray=True))
     assert frame.max_disparity is None or np.nanmax(occ) < frame.max_disparity
     with pytest.raises(OptionError, match="count must be at least 1, got 0"):
         datasets.scenes(0)
@@ -289,7 +289,7 @@ def test_real_layouts(name, pairs, noc, occ):
     root = DATA / name
     if not root.is_dir():
         pytest.skip(f"no {name} in {DATA}; set STEREOKIT_DATA")
-    frames = datasets.load(name, root)
+    frames = datasets.load_frames(name, root)
     assert len(frames) == len(list(root.glob(pairs))) > 0
     if noc is not None:
         assert sum(frame.noc is not None for frame in frames) == len(list(root.glob(noc)))

@@ -39,13 +39,13 @@ def constant(value, missing=()):
 class FakeMatcher:
     """Stands in for `stereokit.Matcher`: disparity 10 by semi-global methods, 20 by anything else."""
 
-    made: list[dict] = []  # noqa: RUF012
+    instances: list[dict] = []  # noqa: RUF012
 
     def __init__(self, method="census+sgm", *, max_disparity=128, scale=1.0, refiner=None, device="auto", **rest):
         if method == "nonsense":
             raise UnknownNameError("no cost named 'nonsense'")
         self.method, self.device = {"S4": "zncc+sgm"}.get(method, method), "cpu"
-        FakeMatcher.made.append({"max_disparity": max_disparity, "scale": scale, "refiner": refiner, **rest})
+        FakeMatcher.instances.append({"max_disparity": max_disparity, "scale": scale, "refiner": refiner, **rest})
 
     def __call__(self, left, right):
         if left.mean() == 66:
@@ -56,7 +56,7 @@ class FakeMatcher:
 @pytest.fixture
 def fake(monkeypatch):
     monkeypatch.setattr("stereokit.Matcher", FakeMatcher, raising=False)
-    FakeMatcher.made = []
+    FakeMatcher.instances = []
     return FakeMatcher
 
 
@@ -157,7 +157,7 @@ def test_broken_frames_are_skipped_with_a_reason(kitti):
     assert "000000_10.png" in reasons["000000"] and "000001_10.png" in reasons["000001"]
     assert reasons["000003"].startswith("left and right must have one size")
     assert reasons["000004"].startswith("noc must have the size of the estimate")
-    assert reasons["000005"] == "no ground truth found"
+    assert reasons["000005"] == "the frame has no ground truth"
     assert all("\n" not in reason for reason in reasons.values())
 
 
@@ -194,7 +194,7 @@ def test_the_command_writes_table_and_json(kitti, tmp_path, fake):
     done = command(*words, "--set", "p1=10", "--set", "mode=rf", "--set", "sub-pixel=false", "--threads", 1)
     assert done.exit_code == 0, done.output
     assert "zncc+sgm" in done.stdout and "census+dt" in done.stdout and "D1 noc" in done.stdout
-    assert fake.made[0] == {
+    assert fake.instances[0] == {
         "max_disparity": 128,
         "scale": 1.0,
         "refiner": None,
@@ -249,7 +249,7 @@ def test_skipped_frames_are_reported_once_and_fail_the_run(kitti, tmp_path, fake
     done = command(*words)
     assert done.exit_code == 1
     lines = [line for line in done.stderr.splitlines() if line.startswith("skipped ")]
-    assert len(lines) == 5 and lines[4] == "skipped 000005_10: no ground truth found"
+    assert len(lines) == 5 and lines[4] == "skipped 000005_10: the frame has no ground truth"
     document = read(out)
     assert [skip["frame"][:6] for skip in document["skipped"]] == [
         "000000",
@@ -315,7 +315,7 @@ def test_disparities_follow_the_data_set(tmp_path, fake):
     words = ("--dataset", "eth3d", "--root", tmp_path)
     assert command(*words).exit_code == 1  # the pair has no ground truth
     assert command(*words, "--max-disparity", 64).exit_code == 1
-    assert [made["max_disparity"] for made in fake.made] == [40, 64]
+    assert [instance["max_disparity"] for instance in fake.instances] == [40, 64]
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_disparities_follow_the_data_set(tmp_path, fake):
         (("--set", "scale=1"), OptionError, "--set scale: use --scale instead"),
         (("--method", "nonsense"), UnknownNameError, "no cost named"),
         (("--predictions", "nowhere"), FileError, "predictions must be a folder"),
-        (("--predictions", ".", "--method", "S1"), OptionError, "method must not be given with predictions"),
+        (("--predictions", ".", "--method", "S1"), OptionError, "method must not be set with predictions"),
         (("--json", "nowhere/out.json"), FileError, "--json 'nowhere/out.json': the folder"),
         (("--json", "."), FileError, "is a folder, expected a file"),
     ],
@@ -382,7 +382,7 @@ def test_refiners_have_a_row_each(kitti, tmp_path, fake):
     assert done.exit_code == 0, done.output
     rows = [(row["method"], row["refiner"]) for row in read(out)["results"]]
     assert rows == [(method, refiner) for method in ("zncc+sgm", "other") for refiner in ("linear", "stereokit")]
-    assert [made["refiner"] for made in fake.made] == ["linear", "stereokit"] * 2
+    assert [instance["refiner"] for instance in fake.instances] == ["linear", "stereokit"] * 2
     assert sorted(path.name for path in maps.iterdir()) == sorted(f"{m}-{r}" for m, r in rows)
     table = command(*words, "--method", "S4").stdout
     assert "zncc+sgm linear x0.5" in table and "zncc+sgm stereokit x0.5" in table

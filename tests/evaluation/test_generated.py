@@ -68,7 +68,7 @@ def cast(scene, start, direction):
 @pytest.mark.parametrize("offset", [False, True])
 def test_truth_and_visibility_are_those_of_cast_rays(offset):
     stage, cameras = small_stage(offset=offset), rig()
-    scene, made = stage.triangles(), render(stage, cameras, np.random.default_rng(0))
+    scene, pair = stage.triangles(), render(stage, cameras, np.random.default_rng(0))
     focal, cx, cy = 24 / np.tan(0.55), 23.5, 17.5
     rays = [np.array([(x - cx) / focal, (y - cy) / focal, 1.0]) for y in range(36) for x in range(48)]
     depth = np.array([cast(scene, np.zeros(3), ray).min() for ray in rays]).reshape(36, 48)
@@ -79,17 +79,17 @@ def test_truth_and_visibility_are_those_of_cast_rays(offset):
     else:
         baseline, shift = 9.0 / (focal * inverse.max()), 0.0
     truth = focal * baseline * inverse - shift
-    near = np.abs(made.truth - truth) < 1e-4
+    near = np.abs(pair.truth - truth) < 1e-4
     assert near.mean() > 0.998  # a ray through the very edge of a triangle may fall on either side
-    assert made.truth.max() == pytest.approx(9.0, abs=1e-5)
+    assert pair.truth.max() == pytest.approx(9.0, abs=1e-5)
     eye = np.array([baseline, 0.0, 0.0])
-    seen = np.empty(depth.shape, bool)
+    visible = np.empty(depth.shape, bool)
     for k, ray in enumerate(rays):
         point = ray * depth.flat[k]
         first = cast(scene, eye, point - eye).min()
-        seen.flat[k] = first > 1 - 1e-6 and k % 48 - truth.flat[k] >= 0
-    assert 0.02 < (~seen).mean() < 0.5
-    assert (seen == made.seen)[near].mean() > 0.997
+        visible.flat[k] = first > 1 - 1e-6 and k % 48 - truth.flat[k] >= 0
+    assert 0.02 < (~visible).mean() < 0.5
+    assert (visible == pair.seen)[near].mean() > 0.997
 
 
 def test_a_ball_has_the_depth_of_a_sphere():
@@ -120,18 +120,18 @@ def test_the_right_view_shows_each_point_where_the_truth_says():
     stage.light = {"ambient": 1.0}
     stage.add(sheet(30, 20), stage.paint("fractal", 4.0, 0.5, 1.2), None, rotation(0.5), (0, 0, 8))
     for lift in (0.0, 3.0):
-        made = render(stage, rig(160, 96, 14.0, lift=lift), np.random.default_rng(0))
-        left, right = made.left.astype(float), made.right.astype(float)
+        pair = render(stage, rig(160, 96, 14.0, lift=lift), np.random.default_rng(0))
+        left, right = pair.left.astype(float), pair.right.astype(float)
         inner = np.zeros(left.shape, bool)
         inner[8:-8, 20:-4] = True
-        y, x = np.nonzero(inner & made.seen)
+        y, x = np.nonzero(inner & pair.seen)
 
-        def difference(beside, left=left, right=right, made=made, y=y, x=x, lift=lift):
-            at = x - made.truth[y, x].astype(float) + beside
-            low = np.floor(at).astype(int)
+        def difference(offset, left=left, right=right, pair=pair, y=y, x=x, lift=lift):
+            column = x - pair.truth[y, x].astype(float) + offset
+            low = np.floor(column).astype(int)
             row = right[y + int(lift)]
             picked = np.arange(len(y))
-            got = (1 - at + low) * row[picked, low] + (at - low) * row[picked, low + 1]
+            got = (1 - column + low) * row[picked, low] + (column - low) * row[picked, low + 1]
             return np.abs(got - left[y, x]).mean()
 
         assert difference(0.0) < 0.6 * difference(0.5)
@@ -328,18 +328,18 @@ def test_options_outside_their_rule_are_refused(call, message):
 
 
 def test_a_stopped_run_goes_on_where_it_was(tmp_path, monkeypatch):
-    asked = []
+    requests = []
 
     def quick(seed, kind=None):
-        asked.append(seed)
+        requests.append(seed)
         flat = np.full((2, 3), seed, np.uint8)
         return GeneratedPair(flat, flat, flat.astype(np.float32), flat > 0, kind or kind_of(seed), seed)
 
     monkeypatch.setattr(generated, "generate_pair", quick)
     first = list(pairs(2, 10, folder=tmp_path))
     both = list(pairs(4, 10, folder=tmp_path))
-    assert asked == [10, 11, 12, 13] and [pair.seed for pair in both] == [10, 11, 12, 13]
+    assert requests == [10, 11, 12, 13] and [pair.seed for pair in both] == [10, 11, 12, 13]
     assert both[1].left.tobytes() == first[1].left.tobytes() and both[1].kind == kind_of(11)
     monkeypatch.setattr(generated, "_sources", lambda: "other")
     list(pairs(1, 10, folder=tmp_path))
-    assert asked[-1] == 10  # what older code made is not taken
+    assert requests[-1] == 10  # what older code made is not taken

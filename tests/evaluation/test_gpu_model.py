@@ -143,9 +143,9 @@ def kernels():
 @pytest.mark.parametrize("method", ["S1", "S2", "S3", "S4"])
 def test_every_launch_of_a_default_match_is_known(kernels, method, scale, levels):
     matcher = Matcher(method, max_disparity=levels, scale=scale, device="cpu")
-    found = gpu_model.record(matcher, 301, 120)
-    assert len(found) > 10
-    assert all(one.blocks >= 1 and one.moved > 0 for one in found)
+    launches = gpu_model.record(matcher, 301, 120)
+    assert len(launches) > 10
+    assert all(one.blocks >= 1 and one.moved > 0 for one in launches)
 
 
 def test_what_is_not_known_is_refused(kernels):
@@ -192,8 +192,8 @@ def test_the_tables_say_modelled(assembled):
 
 def test_json_has_every_launch_and_its_sum(assembled):
     done = bench("--model", "--method", "S2", "--sizes", "101x50x32", "--json", "-")
-    found = json.loads(done.stdout)
-    (match,) = found["modelled"]
+    document = json.loads(done.stdout)
+    (match,) = document["modelled"]
     assert (match["method"], match["levels"], match["scale"]) == ("census+sgm", 32, 1)
     names = {machine.name for machine in MACHINES}
     assert set(match["modelled_ms"]) == names
@@ -204,8 +204,8 @@ def test_json_has_every_launch_and_its_sum(assembled):
             longest = max(part["memory"], part["units"], part["waiting"])
             assert part["all"] == pytest.approx(longest + part["launch"])
     assert match["bytes"] == sum(one["read"] + one["written"] for one in match["launches"])
-    assert {one["name"] for one in found["published"]} >= {"libSGM, 4 paths"}
-    assert found["versions"]["stereokit"]
+    assert {one["name"] for one in document["published"]} >= {"libSGM, 4 paths"}
+    assert document["versions"]["stereokit"]
 
 
 def test_without_the_tools_it_says_what_to_install(monkeypatch):
@@ -240,7 +240,7 @@ def test_without_a_gpu_there_is_nothing_to_time():
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--device", "gpu"), "device must be 'cpu' or 'cuda', got 'gpu'"),
         (("--model", "--pipeline"), "model and pipeline are two tables, got both; choose one"),
@@ -254,7 +254,7 @@ def test_without_a_gpu_there_is_nothing_to_time():
         (("--model", "--json", "no/such/folder.json"), "json 'no/such/folder.json'"),
     ],
 )
-def test_bad_input_exits_with_2_and_one_line(words, said):
+def test_bad_input_exits_with_2_and_one_line(words, message):
     done = bench(*words)
     assert done.exit_code == 2 and not done.stdout
-    assert done.stderr.startswith("error: ") and said in done.stderr and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: ") and message in done.stderr and done.stderr.count("\n") == 1

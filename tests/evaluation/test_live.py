@@ -49,8 +49,8 @@ def video(tmp_path_factory):
     return path
 
 
-class Given:
-    """A source of given frames, as fast as they are asked for."""
+class FakeSource:
+    """A source of the frames of a list, without delay."""
 
     def __init__(self, frames):
         self.frames, self.dropped, self.closed = list(frames), 0, False
@@ -175,7 +175,7 @@ def test_sources_that_cannot_be(inputs, options, line):
 
 def test_the_engine_matches_what_a_matcher_matches():
     camera = stereokit.Calibration(fx=100.0, fy=100.0, cx0=48.0, cy=24.0, baseline_m=0.12)
-    engine = finished(Engine(Given([Frame(3, *pair_of(30))]), camera, max_disparity=32, fill=None))
+    engine = finished(Engine(FakeSource([Frame(3, *pair_of(30))]), camera, max_disparity=32, fill=None))
     expected = stereokit.Matcher(max_disparity=32, confidence=True, fill=None)(*pair_of(30))
     assert np.array_equal(engine.view.result.disparity, expected.disparity, equal_nan=True)
     at = engine.at(60, 30)
@@ -193,7 +193,7 @@ def test_the_engine_matches_what_a_matcher_matches():
 def test_settings_change_from_the_next_frame_on_and_wrong_ones_change_nothing():
     gate = threading.Event()
 
-    class Waiting(Given):
+    class Waiting(FakeSource):
         def newest(self):
             frame = super().newest()
             if frame is not None and frame.number == 1:
@@ -225,10 +225,10 @@ def test_settings_change_from_the_next_frame_on_and_wrong_ones_change_nothing():
 
 def test_a_frame_that_cannot_be_matched_is_told_and_passed_over():
     left, right = pair_of(0)
-    engine = finished(Engine(Given([Frame(0, left, right[:-1]), Frame(1, left, right)]), max_disparity=32))
+    engine = finished(Engine(FakeSource([Frame(0, left, right[:-1]), Frame(1, left, right)]), max_disparity=32))
     assert engine.view.frame.number == 1
     assert engine.message == ""
-    engine = finished(Engine(Given([Frame(0, left, right[:-1])]), max_disparity=32))
+    engine = finished(Engine(FakeSource([Frame(0, left, right[:-1])]), max_disparity=32))
     assert "same size" in engine.message
 
 

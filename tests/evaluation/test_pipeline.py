@@ -60,7 +60,7 @@ def test_the_json_has_every_row(refiners):
 def test_the_refiner_is_part_of_the_time(refiners):
     rows = []
     images = tuple(np.random.default_rng(0).integers(0, 256, (2, 32, 96), np.uint8))
-    pipeline.time_pipeline(Size("x", 96, 32, 16), 1, ["S4"], images, 3, rows, with_peers=False)
+    pipeline.time_pipeline(Size("x", 96, 32, 16), 1, ["S4"], images, 3, rows, with_baselines=False)
     linear = next(row for row in rows if row.name == "S4 Mini+Linear")
     assert len(linear.seconds) == len(linear.parts["refine"]) == 3
     assert 0 < linear.part_ms("refine") < linear.spread.median

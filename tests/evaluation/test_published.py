@@ -15,9 +15,9 @@ def test_the_test_figure_is_the_noc_column_of_the_table():
 
 def test_figure_1_mixes_the_columns_of_the_table_as_its_points_say():
     column = {"occ": 0, "noc": 1}
-    told = [point for point in published.FIGURE_1 if point.pixels]
-    assert {point.name for point in told} == {"RTSMNet", "GPUBNN", "ReS2tAC", "StereoVAE"}
-    for point in told:
+    points = [point for point in published.FIGURE_1 if point.pixels]
+    assert {point.name for point in points} == {"RTSMNet", "GPUBNN", "ReS2tAC", "StereoVAE"}
+    for point in points:
         assert TABLE[point.name].all[column[point.pixels]] == point.d1
 
 

@@ -35,8 +35,8 @@ def command(name, *words):
 
 
 def blocks(page):
-    found = re.findall(r'<script type="application/json" id="([^"]+)">(.*?)</script>', page, flags=re.DOTALL)
-    return {name: json.loads(text) for name, text in found}
+    matches = re.findall(r'<script type="application/json" id="([^"]+)">(.*?)</script>', page, flags=re.DOTALL)
+    return {name: json.loads(text) for name, text in matches}
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def study_page(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets, "_SCENE_SIZE", (160, 96))
         datasets._scene.cache_clear()
-        words = ["--count", 3, "--method", "S2", "--setting", "linear", "--setting", "original", "--setting", "cnn"]
+        words = ["--count", 3, "--method", "S2", "--variant", "linear", "--variant", "original", "--variant", "cnn"]
         words += ["--max-disparity", 32, "--threads", 1, "--repeats", 1, "--show", 2, "-o", out]
         done = command("study", *words, "--json", out / "study.json")
     datasets._scene.cache_clear()
@@ -75,9 +75,9 @@ def test_the_tables_hold_the_figures(study_page):
 
 def test_the_charts_are_valid_plotly(study_page):
     _, page = study_page
-    found = blocks(page)["charts"]
-    assert list(found) == ["chart-e4", "chart-e5", "chart-time"]
-    for figure in found.values():
+    content = blocks(page)["charts"]
+    assert list(content) == ["chart-e4", "chart-e5", "chart-time"]
+    for figure in content.values():
         drawn = plotly.Figure(data=figure["data"], layout=figure["layout"])  # refuses what Plotly does not know
         ((_, variants),) = figure["variants"].items()
         assert list(variants) == list(charts.REGIONS)
@@ -121,9 +121,9 @@ def test_frames_to_look_at_run_from_easy_to_hard():
 
 def test_what_stands_in_a_page_cannot_break_out_of_it():
     hostile = "</script><script>alert(1)</script>"
-    shown = viewer.Shown(hostile, np.ones((4, 6), np.float32), np.ones((4, 6), bool), hostile)
-    made = viewer.pair(hostile, np.zeros((4, 6), np.uint8), [shown])
-    page = render("view.html.j2", [made], title=hostile, version="0", maps=[shown], methods=[hostile, hostile]).decode()
+    shown = viewer.MethodMap(hostile, np.ones((4, 6), np.float32), np.ones((4, 6), bool), hostile)
+    pair = viewer.pair(hostile, np.zeros((4, 6), np.uint8), [shown])
+    page = render("view.html.j2", [pair], title=hostile, version="0", maps=[shown], methods=[hostile, hostile]).decode()
     assert "<script>alert" not in page
     assert blocks(page)["pair-0"]["name"] == hostile
 
@@ -131,22 +131,22 @@ def test_what_stands_in_a_page_cannot_break_out_of_it():
 def test_gaps_are_filled_and_marked(random_pair):
     disparity = np.full((4, 6), 5, np.float32)
     disparity[:, 2] = np.nan
-    made = viewer.pair("x", random_pair(4, 6)[0], [viewer.Shown("m", disparity, np.ones((4, 6), bool))])
-    assert (unpack_map(made["maps"][0]["map"]) == 5).all()
-    assert (unpack_mask(made["maps"][0]["measured"], (4, 6)) == np.isfinite(disparity)).all()
-    assert made["truth"] is None and made["calibration"] is None
+    pair = viewer.pair("x", random_pair(4, 6)[0], [viewer.MethodMap("m", disparity, np.ones((4, 6), bool))])
+    assert (unpack_map(pair["maps"][0]["map"]) == 5).all()
+    assert (unpack_mask(pair["maps"][0]["measured"], (4, 6)) == np.isfinite(disparity)).all()
+    assert pair["truth"] is None and pair["calibration"] is None
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_any_image_can_be_shown(dtype):
     for shape in ((5, 7), (5, 7, 3)):
         image = np.full(shape, 0.5 if dtype == np.float32 else np.iinfo(dtype).max // 2, dtype)
-        shown = viewer.Shown("m", np.ones((5, 7), np.float32), np.ones((5, 7), bool))
+        shown = viewer.MethodMap("m", np.ones((5, 7), np.float32), np.ones((5, 7), bool))
         assert viewer.pair("x", image, [shown])["left"].startswith("data:image/jpeg;base64,")
 
 
 def test_maps_of_another_size_are_refused():
-    shown = viewer.Shown("m", np.ones((5, 7), np.float32), np.ones((5, 7), bool))
+    shown = viewer.MethodMap("m", np.ones((5, 7), np.float32), np.ones((5, 7), bool))
     with pytest.raises(InputError, match="m must have the size of the left image"):
         viewer.pair("x", np.zeros((5, 8), np.uint8), [shown])
     with pytest.raises(InputError, match="at least one map"):
@@ -184,8 +184,8 @@ def test_view_writes_one_page(files, monkeypatch):
     done = command(*words, "-o", files / "out.html")
     assert done.exit_code == 0, (done.output, done.exception)
     assert "no calibration: no depth, and the point cloud is in pixels" in done.stdout and not opened
-    found = blocks((files / "out.html").read_text())
-    assert [entry["name"] for entry in found["pair-0"]["maps"]] == ["S2", "S4"] and found["pair-0"]["truth"] is None
+    content = blocks((files / "out.html").read_text())
+    assert [entry["name"] for entry in content["pair-0"]["maps"]] == ["S2", "S4"] and content["pair-0"]["truth"] is None
     known = ("--calibration", files / "camera.json", "--truth", files / "truth.png", "--json", "-", "--open")
     done = command(*words, *known, "-o", files / "known.html")
     assert json.loads(done.stdout)["methods"] == ["S2", "S4"] and opened[0].startswith("file://")
@@ -215,7 +215,7 @@ def test_view_takes_refiners(files):
 )
 def test_view_refuses_bad_input_in_one_line(files, words, kind, message, monkeypatch):
     monkeypatch.chdir(files)
-    given = ("view", "--max-disparity", 16, *(() if "-o" in words else ("-o", "out.html")), *words)
-    done = command(*given)
+    arguments = ("view", "--max-disparity", 16, *(() if "-o" in words else ("-o", "out.html")), *words)
+    done = command(*arguments)
     assert isinstance(done.exception, kind) and message in str(done.exception)
     assert "\n" not in str(done.exception) and not (files / "out.html").exists()

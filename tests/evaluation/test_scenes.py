@@ -274,9 +274,9 @@ def test_scenes_are_about_as_hard_as_kitti():
     grey = [cv2.copyMakeBorder(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), 0, 0, 64, 0, cv2.BORDER_REPLICATE)
             for i in (scene.left, scene.right)]  # fmt: skip
     matcher = cv2.StereoSGBM_create(0, 64, 5, 200, 800, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY)
-    found = matcher.compute(*grey)[:, 64:].astype(np.float32) / 16
-    measured = (found >= 0) & np.isfinite(scene.noc)
-    error = np.abs(found - scene.disparity)[measured]
+    disparity = matcher.compute(*grey)[:, 64:].astype(np.float32) / 16
+    measured = (disparity >= 0) & np.isfinite(scene.noc)
+    error = np.abs(disparity - scene.disparity)[measured]
     assert measured.mean() > 0.75 and (error > 3).mean() < 0.08 and np.median(error) < 0.25
 
 

@@ -14,11 +14,11 @@ from stereokit import matching
 from stereokit.cli.app import app
 from stereokit.errors import OptionError, StereokitError, UnknownNameError
 from stereokit.kernels.trace import observed, span
-from stereokit_evaluation.bench import peers
+from stereokit_evaluation.bench import baselines
 from stereokit_evaluation.bench import table as speed_table
-from stereokit_evaluation.bench.probes import ProbeError, first_call, memory_added, stored
+from stereokit_evaluation.bench.probes import ProbeError, first_call, image_files, memory_added
 from stereokit_evaluation.bench.stages import OTHER, TOTAL, StageTimer, stage_times
-from stereokit_evaluation.bench.table import Findings, as_json, print_tables
+from stereokit_evaluation.bench.table import BenchResult, as_json, print_tables
 from stereokit_evaluation.bench.timing import ratio, round_robin, spread
 from stereokit_evaluation.commands import bench as command
 from stereokit_evaluation.common import progress as progress_module
@@ -33,7 +33,7 @@ def bench(*words):
 
 @pytest.fixture
 def one_peer(monkeypatch):
-    monkeypatch.setattr(command, "peers", lambda: [peers.THREE_WAY])
+    monkeypatch.setattr(command, "baselines", lambda: [baselines.THREE_WAY])
 
 
 # sizes and threads
@@ -85,10 +85,10 @@ def test_round_robin_takes_turns_and_times_with_its_clock():
 
         return call
 
-    times, told = {}, []
+    times, steps = {}, []
     calls = {"a": costs("a", [1, 2, 4]), "b": costs("b", [10, 20, 30]), "c": costs("c", [5])}
-    round_robin(calls, 3, times, most={"c": 1}, clock=lambda: now, step=told.append)
-    assert order == told == ["a", "b", "c", "a", "b", "a", "b"]
+    round_robin(calls, 3, times, max_rounds={"c": 1}, clock=lambda: now, step=steps.append)
+    assert order == steps == ["a", "b", "c", "a", "b", "a", "b"]
     assert times == {"a": [1, 2, 4], "b": [10, 20, 30], "c": [5]}
 
 
@@ -106,8 +106,8 @@ def test_round_robin_leaves_what_it_has_when_it_is_stopped():
 
 
 def test_spread_by_hand():
-    found = spread([4.0, 1.0, 3.0, 2.0, 10.0])
-    assert (found.least, found.q25, found.median, found.q75, found.runs) == (1, 2, 3, 4, 5)
+    times = spread([4.0, 1.0, 3.0, 2.0, 10.0])
+    assert (times.least, times.q25, times.median, times.q75, times.runs) == (1, 2, 3, 4, 5)
     assert spread([1.0, 2.0]).median == 1.5
     one = spread([7.0])
     assert (one.least, one.q25, one.median, one.q75, one.runs) == (7, 7, 7, 7, 1)
@@ -127,22 +127,26 @@ def test_ratio_says_how_many_times_faster():
 
 
 @pytest.fixture
-def findings():
+def bench_result():
     """Two threads only; HH 300 ms, 3WAY 20 ms, ours 30 ms: ten times faster than one and slower than the other."""
     size = Size("100x10x50", 100, 10, 50)
-    found = Findings(methods=["census+sgm"], sizes=[size], threads=[2], rounds=3)
-    found.times[size.name, 2] = {
+    result = BenchResult(methods=["census+sgm"], sizes=[size], threads=[2], rounds=3)
+    result.times[size.name, 2] = {
         "census+sgm": [0.03, 0.02, 0.05],
-        peers.HH: [0.3, 0.3, 0.3],
-        peers.THREE_WAY: [0.02, 0.01, 0.03],
+        baselines.HH: [0.3, 0.3, 0.3],
+        baselines.THREE_WAY: [0.02, 0.01, 0.03],
     }
-    found.memory = {(size.name, "census+sgm"): 50.0, (size.name, peers.HH): 200.0, (size.name, peers.THREE_WAY): None}
-    found.first, found.first_size = {"census+sgm": {"import_s": 0.5, "call_s": 0.25}}, size.name
-    return found
+    result.memory = {
+        (size.name, "census+sgm"): 50.0,
+        (size.name, baselines.HH): 200.0,
+        (size.name, baselines.THREE_WAY): None,
+    }
+    result.first, result.first_size = {"census+sgm": {"import_s": 0.5, "call_s": 0.25}}, size.name
+    return result
 
 
-def test_rows_hold_medians_and_ratios(findings):
-    ours, hh, three_way = findings.rows()
+def test_rows_hold_medians_and_ratios(bench_result):
+    ours, hh, three_way = bench_result.rows()
     assert ours["contender"] == "S2 census+sgm" and ours["kind"] == "method" and hh["kind"] == "peer"
     assert ours["median_ms"] == pytest.approx(30) and ours["min_ms"] == pytest.approx(20)
     assert (ours["q25_ms"], ours["q75_ms"]) == pytest.approx((25, 40))
@@ -151,22 +155,22 @@ def test_rows_hold_medians_and_ratios(findings):
     assert ours["mde_per_s"] == pytest.approx(50_000 / 0.03 / 1e6)
 
 
-def test_memory_is_compared_with_hh(findings):
-    memory = {entry["key"]: entry for entry in as_json(findings, {})["memory"]}
+def test_memory_is_compared_with_hh(bench_result):
+    memory = {entry["key"]: entry for entry in as_json(bench_result, {})["memory"]}
     assert memory["census+sgm"]["of_hh"] == 0.25
-    assert memory[peers.THREE_WAY]["mb"] is None and memory[peers.THREE_WAY]["of_hh"] is None
+    assert memory[baselines.THREE_WAY]["mb"] is None and memory[baselines.THREE_WAY]["of_hh"] is None
 
 
-def test_ratios_need_their_peer(findings):
-    del findings.times["100x10x50", 2][peers.HH]
-    assert findings.rows()[0]["x_hh"] is None
+def test_ratios_need_their_peer(bench_result):
+    del bench_result.times["100x10x50", 2][baselines.HH]
+    assert bench_result.rows()[0]["x_hh"] is None
 
 
-def test_tables_publish_losses(findings, capsys):
-    findings.stages["100x10x50", "census+sgm"] = {"smooth": 1.0, OTHER: 0.5, TOTAL: 1.5}
-    findings.skip(findings.sizes[0], "OpenCV HH4", 2, "needs [1] GB")
-    findings.load = [3.25, 2.0, 1.0]
-    print_tables(findings)
+def test_tables_publish_losses(bench_result, capsys):
+    bench_result.stages["100x10x50", "census+sgm"] = {"smooth": 1.0, OTHER: 0.5, TOTAL: 1.5}
+    bench_result.skip(bench_result.sizes[0], "OpenCV HH4", 2, "needs [1] GB")
+    bench_result.load = [3.25, 2.0, 1.0]
+    print_tables(bench_result)
     text = capsys.readouterr().out
     ours = next(line for line in text.splitlines() if line.startswith(" S2 census+sgm") or "S2 census+sgm  " in line)
     assert "10.00" in ours and "0.67" in ours and "0.25" in ours
@@ -185,34 +189,34 @@ def test_a_ratio_below_one_stands_out_for_methods_only():
 
 
 def test_labels_and_makers():
-    assert peers.label("zncc+sgm") == "S4 zncc+sgm"
-    assert peers.label(peers.HH) == peers.HH
+    assert baselines.label("zncc+sgm") == "S4 zncc+sgm"
+    assert baselines.label(baselines.HH) == baselines.HH
     with pytest.raises(UnknownNameError):
-        peers.make("S9", 16, 1)
+        baselines.make("S9", 16, 1)
 
 
 def test_opencv_takes_the_next_multiple_of_16():
-    assert [peers.usable_levels(levels) for levels in (1, 16, 17, 256)] == [16, 16, 32, 256]
+    assert [baselines.usable_levels(levels) for levels in (1, 16, 17, 256)] == [16, 16, 32, 256]
 
 
-@pytest.mark.parametrize("name", peers.peers())
+@pytest.mark.parametrize("name", baselines.baselines())
 def test_every_peer_finds_a_shift(name):
     rng = np.random.default_rng(0)
     left = cv2.resize(rng.integers(0, 256, (20, 40), np.uint8), (160, 60), interpolation=cv2.INTER_CUBIC)
-    found = peers.make(name, 16, 1)(left, np.roll(left, -6, axis=1)).astype(np.float64)
+    disparity = baselines.make(name, 16, 1)(left, np.roll(left, -6, axis=1)).astype(np.float64)
     unit = 16 if name.startswith("OpenCV") else 1
-    assert found.shape == (60, 160)
-    assert np.nanmedian(found[:, 40:] / unit) == pytest.approx(6, abs=0.2)
+    assert disparity.shape == (60, 160)
+    assert np.nanmedian(disparity[:, 40:] / unit) == pytest.approx(6, abs=0.2)
 
 
 def test_a_peer_that_the_machine_cannot_hold_is_left_out(monkeypatch):
     monkeypatch.setattr(command, "free_nbytes", lambda: 10**9)
     big = Size("big", 4000, 3000, 256)
-    assert command._too_large(peers.HH, big) == "needs 12.3 GB of memory, 1.0 GB are free"
-    assert command._too_large(peers.HH, SIZES["K"]) is None
+    assert command._too_large(baselines.HH, big) == "needs 12.3 GB of memory, 1.0 GB are free"
+    assert command._too_large(baselines.HH, SIZES["K"]) is None
     assert command._too_large("census+sgm", big) is None
     monkeypatch.setattr(command, "free_nbytes", lambda: 16 * 10**9)
-    assert command._too_large(peers.HH, big) is None
+    assert command._too_large(baselines.HH, big) is None
 
 
 # stages and probes
@@ -245,10 +249,10 @@ def test_spans_outside_of_an_observer_are_seen_by_nobody():
 
 def test_stages_add_up(random_pair):
     left, right = random_pair(24, 64)
-    found = stage_times("census+sgm", 16, left, right, 1)
-    assert list(found)[-2:] == [OTHER, TOTAL]
-    assert sum(found.values()) == pytest.approx(2 * found[TOTAL])
-    assert {"prepare cost", "sweep: first visit", "sweep: last visit", "post-processing"} <= set(found)
+    times = stage_times("census+sgm", 16, left, right, 1)
+    assert list(times)[-2:] == [OTHER, TOTAL]
+    assert sum(times.values()) == pytest.approx(2 * times[TOTAL])
+    assert {"prepare cost", "sweep: first visit", "sweep: last visit", "post-processing"} <= set(times)
 
 
 def test_stages_of_an_unknown_core_are_other(monkeypatch):
@@ -257,13 +261,13 @@ def test_stages_of_an_unknown_core_are_other(monkeypatch):
 
     monkeypatch.setattr(matching, "Matcher", plain)
     ticks = iter([0.0, 2.0])
-    found = stage_times("any", 16, np.zeros(1, np.uint8), np.zeros(1, np.uint8), 1, clock=lambda: next(ticks))
-    assert found == {OTHER: 2000.0, TOTAL: 2000.0}
+    times = stage_times("any", 16, np.zeros(1, np.uint8), np.zeros(1, np.uint8), 1, clock=lambda: next(ticks))
+    assert times == {OTHER: 2000.0, TOTAL: 2000.0}
 
 
 def test_probes_measure_in_new_processes(random_pair):
-    with stored(*random_pair(48, 64)) as files:
-        memory = memory_added(peers.THREE_WAY, 16, 1, files)
+    with image_files(*random_pair(48, 64)) as files:
+        memory = memory_added(baselines.THREE_WAY, 16, 1, files)
         assert memory is None or 0 <= memory < 1000
         first = first_call("census+sgm", 16, 1, files)
         assert set(first) == {"import_s", "call_s"} and min(first.values()) > 0
@@ -283,26 +287,26 @@ def test_json_has_everything(tmp_path, one_peer):
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert cv2.getNumThreads() == threads
-    assert "S2 census+sgm" in done.stdout and peers.THREE_WAY in done.stdout and "stages" in done.stdout
-    found = json.loads(target.read_text())
-    assert list(found) == [
+    assert "S2 census+sgm" in done.stdout and baselines.THREE_WAY in done.stdout and "stages" in done.stdout
+    document = json.loads(target.read_text())
+    assert list(document) == [
         "results", "memory", "first_call", "stages", "skipped", "sizes", "options", "interrupted",
         "versions", "machine",
     ]  # fmt: skip
-    assert [(row["key"], row["threads"], row["runs"]) for row in found["results"]] == [
-        ("census+sgm", 1, 1), (peers.THREE_WAY, 1, 1), ("census+sgm", 2, 1), (peers.THREE_WAY, 2, 1),
+    assert [(row["key"], row["threads"], row["runs"]) for row in document["results"]] == [
+        ("census+sgm", 1, 1), (baselines.THREE_WAY, 1, 1), ("census+sgm", 2, 1), (baselines.THREE_WAY, 2, 1),
     ]  # fmt: skip
-    row = found["results"][0]
+    row = document["results"][0]
     assert row["min_ms"] == row["median_ms"] == row["samples_ms"][0] > 0
     assert row["x_3way"] > 0 and row["x_hh"] is None
-    assert found["memory"] == found["first_call"] == found["skipped"] == []
-    assert found["stages"][0]["ms"]["total"] > 0
-    assert 0 <= found["stages"][0]["allocated_bytes"] < 64_000
-    assert found["sizes"][TINY] == {"width": 64, "height": 48, "max_disparity": 16, "opencv_disparities": 16}
-    assert found["options"]["threads"] == [1, 2] and found["options"]["images"] == "synthetic"
-    assert set(found["versions"]) >= {"stereokit", "numba", "numpy", "opencv", "python"}
-    assert found["machine"]["vector_bits"] in (128, 256, 512) and found["machine"]["cpu"]
-    assert found["interrupted"] is False
+    assert document["memory"] == document["first_call"] == document["skipped"] == []
+    assert document["stages"][0]["ms"]["total"] > 0
+    assert 0 <= document["stages"][0]["allocated_bytes"] < 64_000
+    assert document["sizes"][TINY] == {"width": 64, "height": 48, "max_disparity": 16, "opencv_disparities": 16}
+    assert document["options"]["threads"] == [1, 2] and document["options"]["images"] == "synthetic"
+    assert set(document["versions"]) >= {"stereokit", "numba", "numpy", "opencv", "python"}
+    assert document["machine"]["vector_bits"] in (128, 256, 512) and document["machine"]["cpu"]
+    assert document["interrupted"] is False
 
 
 def test_real_images_without_peers_to_standard_output(tmp_path, random_pair):
@@ -314,9 +318,9 @@ def test_real_images_without_peers_to_standard_output(tmp_path, random_pair):
         *images, "--json", "-",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
-    assert [row["runs"] for row in found["results"]] == [2]
-    assert found["options"]["images"] == [str(tmp_path / "l.png"), str(tmp_path / "r.png")]
+    document = json.loads(done.stdout)
+    assert [row["runs"] for row in document["results"]] == [2]
+    assert document["options"]["images"] == [str(tmp_path / "l.png"), str(tmp_path / "r.png")]
 
 
 def test_memory_and_first_call_are_asked_for_where_they_should(monkeypatch, one_peer):
@@ -324,26 +328,26 @@ def test_memory_and_first_call_are_asked_for_where_they_should(monkeypatch, one_
     monkeypatch.setitem(SIZES, "H", Size("H", 60, 24, 16))
     monkeypatch.setattr(command, "memory_added", lambda key, levels, threads, files: 2.0 if "+" in key else 4.0)
     firsts = iter([9.0, 1.0, 2.0])
-    monkeypatch.setattr(command, "first_call", lambda *given: {"import_s": 1.0, "call_s": next(firsts)})
+    monkeypatch.setattr(command, "first_call", lambda *arguments: {"import_s": 1.0, "call_s": next(firsts)})
     words = "--sizes", "H,K", "--threads", "2", "--method", "S2", "--rounds", "2", "--json", "-"
-    found = json.loads(bench(*words).stdout)
-    assert [(entry["size"], entry["mb"]) for entry in found["memory"]] == [("K", 2.0), ("K", 4.0)]
-    assert [(entry["size"], entry["call_s"]) for entry in found["first_call"]] == [("K", 1.5)]  # not the first, 9
-    found = json.loads(bench(*words, "--memory", "--no-first-call").stdout)
-    assert [entry["size"] for entry in found["memory"]] == ["H", "H", "K", "K"]
+    document = json.loads(bench(*words).stdout)
+    assert [(entry["size"], entry["mb"]) for entry in document["memory"]] == [("K", 2.0), ("K", 4.0)]
+    assert [(entry["size"], entry["call_s"]) for entry in document["first_call"]] == [("K", 1.5)]  # not the first, 9
+    document = json.loads(bench(*words, "--memory", "--no-first-call").stdout)
+    assert [entry["size"] for entry in document["memory"]] == ["H", "H", "K", "K"]
     assert json.loads(bench(*words, "--no-memory", "--no-first-call").stdout)["memory"] == []
 
 
 def test_a_probe_that_fails_says_why(monkeypatch, one_peer):
-    def fails(*given):
+    def fails(*arguments):
         raise ProbeError("out of luck")
 
     monkeypatch.setattr(command, "memory_added", fails)
     monkeypatch.setattr(command, "first_call", fails)
     words = "--sizes", TINY, "--threads", "1", "--method", "S2", "--rounds", "1", "--memory", "--json", "-"
-    found = json.loads(bench(*words).stdout)
-    assert found["memory"] == found["first_call"] == []
-    assert [skip["reason"] for skip in found["skipped"]] == ["out of luck"] * 3
+    document = json.loads(bench(*words).stdout)
+    assert document["memory"] == document["first_call"] == []
+    assert [skip["reason"] for skip in document["skipped"]] == ["out of luck"] * 3
 
 
 def stub(monkeypatch, calls):
@@ -358,11 +362,11 @@ def test_an_interrupt_prints_what_there_is(monkeypatch, one_peer):
         if next(runs) is not None:
             raise KeyboardInterrupt
 
-    stub(monkeypatch, {"census+sgm": lambda left, right: None, peers.THREE_WAY: peer})
+    stub(monkeypatch, {"census+sgm": lambda left, right: None, baselines.THREE_WAY: peer})
     done = bench("--sizes", f"{TINY},K", "--threads", 1, "--method", "S2", "--rounds", 5, "--json", "-")
     assert done.exit_code == 130
-    found = json.loads(done.stdout)
-    assert found["interrupted"] and [row["runs"] for row in found["results"]] == [3, 2]
+    document = json.loads(done.stdout)
+    assert document["interrupted"] and [row["runs"] for row in document["results"]] == [3, 2]
     assert "interrupted" in done.stderr
 
 
@@ -371,16 +375,18 @@ def test_a_peer_that_fails_is_left_out_but_a_method_is_not(monkeypatch, one_peer
         raise RuntimeError("two\nlines")
 
     words = "--sizes", TINY, "--threads", 1, "--method", "S2", "--rounds", 1, "--no-first-call", "--json", "-"
-    stub(monkeypatch, {"census+sgm": lambda left, right: None, peers.THREE_WAY: fails})
-    found = json.loads(bench(*words).stdout)
-    assert [row["key"] for row in found["results"]] == ["census+sgm"]
-    assert found["skipped"] == [{"size": TINY, "contender": peers.THREE_WAY, "threads": 1, "reason": "two lines"}]
-    stub(monkeypatch, {"census+sgm": fails, peers.THREE_WAY: fails})
+    stub(monkeypatch, {"census+sgm": lambda left, right: None, baselines.THREE_WAY: fails})
+    document = json.loads(bench(*words).stdout)
+    assert [row["key"] for row in document["results"]] == ["census+sgm"]
+    assert document["skipped"] == [
+        {"size": TINY, "contender": baselines.THREE_WAY, "threads": 1, "reason": "two lines"}
+    ]
+    stub(monkeypatch, {"census+sgm": fails, baselines.THREE_WAY: fails})
     assert isinstance(bench(*words).exception, RuntimeError)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--sizes", "Q"), "sizes must be K, M, H or WxHxD such as 640x480x64, with commas, got 'Q'"),
         (("--threads", "0"), "threads must be whole numbers"),
@@ -396,11 +402,11 @@ def test_a_peer_that_fails_is_left_out_but_a_method_is_not(monkeypatch, one_peer
         ),
     ],
 )
-def test_bad_input_exits_with_2_and_one_line(words, said, monkeypatch):
-    monkeypatch.setattr(command, "_time", lambda *given: pytest.fail("it began to work"))
+def test_bad_input_exits_with_2_and_one_line(words, message, monkeypatch):
+    monkeypatch.setattr(command, "_time", lambda *arguments: pytest.fail("it began to work"))
     done = bench(*words)
     assert done.exit_code == 2
-    assert done.stderr.startswith("error: ") and said in done.stderr and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: ") and message in done.stderr and done.stderr.count("\n") == 1
     assert not done.stdout
 
 
@@ -412,22 +418,22 @@ def test_pictures_must_match(tmp_path, random_pair):
 
 
 def test_progress_is_drawn_between_calls_only(monkeypatch):
-    made = []
+    bars = []
 
     class Bar:
         def __init__(self, *columns, **options):
-            made.append(options)
+            bars.append(options)
             self.live = SimpleNamespace(is_started=False)
             self.refreshed = 0
 
-        def add_task(self, *given, **options):
+        def add_task(self, *arguments, **options):
             return 0
 
         update = start = stop = add_task
 
         def refresh(self):
             self.refreshed += 1
-            made.append(self.refreshed)
+            bars.append(self.refreshed)
 
     monkeypatch.setattr(progress_module, "Progress", Bar)
     now = iter([0.0, 0.5, 1.5, 1.6])
@@ -435,12 +441,12 @@ def test_progress_is_drawn_between_calls_only(monkeypatch):
     with progress_module.progress(3) as (_, step):
         for _ in range(3):
             step("one")
-    assert made[0]["auto_refresh"] is False
-    assert made[1:] == [1]
+    assert bars[0]["auto_refresh"] is False
+    assert bars[1:] == [1]
 
 
 def test_scenes_without_scikit_image_say_so(monkeypatch):
-    def missing(*given):
+    def missing(*arguments):
         raise StereokitError("scikit-image is not installed")
 
     monkeypatch.setattr(command, "generate", missing)

@@ -58,8 +58,8 @@ def pairs(tmp_path):
 
 
 def command(root, output, *words):
-    given = ["--dataset", "folder", "--root", root, "-o", output, *SMALL, *words]
-    return CliRunner().invoke(APP, [str(word) for word in given])
+    arguments = ["--dataset", "folder", "--root", root, "-o", output, *SMALL, *words]
+    return CliRunner().invoke(APP, [str(word) for word in arguments])
 
 
 def figures(document):
@@ -78,7 +78,7 @@ def run(root, output, *words, status=0):
 
 
 def test_the_table_has_ours_and_the_published_figures(pairs, tmp_path):
-    words = ("--method", "S4", "--method", "S2", "--setting", "linear", "--setting", "original")
+    words = ("--method", "S4", "--method", "S2", "--variant", "linear", "--setting", "original")
     done = command(pairs, tmp_path / "out", *words)
     assert done.exit_code == 0, done.output
     rows = [line.split() for line in done.stdout.splitlines() if line.startswith(" S4")]
@@ -87,7 +87,7 @@ def test_the_table_has_ours_and_the_published_figures(pairs, tmp_path):
 
 
 def test_the_json_has_everything(pairs, tmp_path):
-    document = run(pairs, tmp_path / "out", "--method", "S4", "--setting", "linear", "--setting", "original")
+    document = run(pairs, tmp_path / "out", "--method", "S4", "--variant", "linear", "--variant", "original")
     linear, original = document["results"]
     assert (linear["matcher"], linear["setting"], linear["refiner"], linear["scale"]) == (
         "S4",
@@ -107,7 +107,7 @@ def test_the_json_has_everything(pairs, tmp_path):
 
 
 def test_a_changed_option_recomputes_only_what_it_touches(pairs, tmp_path):
-    out, words = tmp_path / "out", ("--method", "S1", "--method", "S2", "--setting", "original")
+    out, words = tmp_path / "out", ("--method", "S1", "--method", "S2", "--variant", "original")
     first = run(pairs, out, *words)
     again = run(pairs, out, *words)
     assert again["records"] == {"reused": 6, "computed": 0}
@@ -120,7 +120,7 @@ def test_a_changed_option_recomputes_only_what_it_touches(pairs, tmp_path):
 
 
 def test_changed_inputs_are_recomputed(pairs, tmp_path):
-    out, words = tmp_path / "out", ("--method", "S2", "--setting", "original")
+    out, words = tmp_path / "out", ("--method", "S2", "--variant", "original")
     run(pairs, out, *words)
     image = cv2.imread(str(pairs / "left" / "001.png"), cv2.IMREAD_UNCHANGED)
     image[3, 5] ^= 1
@@ -131,7 +131,7 @@ def test_changed_inputs_are_recomputed(pairs, tmp_path):
 
 
 def test_a_damaged_record_is_made_anew(pairs, tmp_path):
-    out, words = tmp_path / "out", ("--method", "S2", "--setting", "original")
+    out, words = tmp_path / "out", ("--method", "S2", "--variant", "original")
     first = run(pairs, out, *words)
     files = sorted((out / "results").rglob("*.json"))
     assert len(files) == 3 and files[0].parent == out / "results" / "S2" / "Original"
@@ -148,13 +148,13 @@ def test_broken_frames_are_left_out_for_all(pairs, tmp_path):
     cv2.imwrite(str(pairs / "right" / "002.png"), np.zeros((5, 6), np.uint8))
     write_disparity(pairs / "disparity" / "003.png", np.full((5, 6), 1.0, np.float32))
     (pairs / "disparity" / "004.png").unlink()
-    document = run(pairs, tmp_path / "out", "--method", "S2", "--method", "S4", "--setting", "original", status=1)
+    document = run(pairs, tmp_path / "out", "--method", "S2", "--method", "S4", "--variant", "original", status=1)
     reasons = {skip["frame"]: skip["reason"] for skip in document["skipped"]}
     assert list(reasons) == ["000", "001", "002", "003", "004"]
     assert "not an image that can be read" in reasons["000"] and "no such file" in reasons["001"]
     assert reasons["002"].startswith("left and right must have one size")
     assert reasons["003"].startswith("occ must have the size of the images")
-    assert reasons["004"] == "no ground truth found"
+    assert reasons["004"] == "the frame has no ground truth"
     assert [row["images"] for row in document["results"]] == [1, 1]
     assert all("\n" not in reason for reason in reasons.values())
 
@@ -164,9 +164,9 @@ def fake(name, behave, missing=None):
 
     def match(left, right):
         behave(left)
-        found = type("Found", (), {})()
-        found.disparity, found.valid = np.full(left.shape, 4.0, np.float32), np.ones(left.shape, bool)
-        return found
+        result = type("Found", (), {})()
+        result.disparity, result.valid = np.full(left.shape, 4.0, np.float32), np.ones(left.shape, bool)
+        return result
 
     return Configuration(name, name, "original", match if missing is None else None, {"name": name}, missing)
 
@@ -184,11 +184,11 @@ def test_a_slip_on_one_frame_leaves_it_out_for_all_and_goes_on():
         if left[0, 0] == 1:
             raise IndexError("a bug")
 
-    told = []
-    found = run_study(frames(), [fake("A", slip), fake("B", lambda left: None)], Store(None), tell=told.append)
-    assert [[frame.name for frame in row.result.frames] for row in found.rows] == [["f0", "f2"]] * 2
-    assert told == ["skipped f1: A Original: IndexError: a bug"]
-    assert [(skip.name, skip.reason) for skip in found.skipped] == [("f1", "A Original: IndexError: a bug")]
+    lines = []
+    study = run_study(frames(), [fake("A", slip), fake("B", lambda left: None)], Store(None), report=lines.append)
+    assert [[frame.name for frame in row.result.frames] for row in study.rows] == [["f0", "f2"]] * 2
+    assert lines == ["skipped f1: A Original: IndexError: a bug"]
+    assert [(skip.name, skip.reason) for skip in study.skipped] == [("f1", "A Original: IndexError: a bug")]
 
 
 def test_a_refiner_that_never_works_is_missing_and_harms_no_frame():
@@ -199,14 +199,14 @@ def test_a_refiner_that_never_works_is_missing_and_harms_no_frame():
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
     cells = [fake("A", never), fake("B", no_runtime), fake("C", lambda left: None), fake("D", None, "not there")]
-    found = run_study(frames(), cells, Store(None))
-    assert [row.missing for row in found.rows] == [
+    study = run_study(frames(), cells, Store(None))
+    assert [row.missing for row in study.rows] == [
         "RuntimeError: weights are broken",
         "needs the package 'torch', which is not installed",
         None,
         "not there",
     ]
-    assert len(found.rows[2].result.frames) == 3 and not found.skipped
+    assert len(study.rows[2].result.frames) == 3 and not study.skipped
 
 
 def test_a_refiner_that_fails_at_first_is_given_up():
@@ -216,17 +216,17 @@ def test_a_refiner_that_fails_at_first_is_given_up():
         calls.append(1)
         raise RuntimeError("weights are broken")
 
-    found = run_study(frames(9), [fake("A", never), fake("B", lambda left: None)], Store(None))
-    assert len(calls) == 3 and found.rows[0].missing == "RuntimeError: weights are broken"
-    assert len(found.rows[1].result.frames) == 9 and not found.skipped
+    study = run_study(frames(9), [fake("A", never), fake("B", lambda left: None)], Store(None))
+    assert len(calls) == 3 and study.rows[0].missing == "RuntimeError: weights are broken"
+    assert len(study.rows[1].result.frames) == 9 and not study.skipped
 
 
 def test_broken_frames_at_the_start_give_nobody_up(pairs):
     write_pairs(pairs, 7)
     for index in range(5):
         (pairs / "left" / f"{index:03d}.png").write_text("no picture")
-    found = run_study(folder(pairs), [fake("A", lambda left: None)], Store(None))
-    assert found.rows[0].missing is None and len(found.rows[0].result.frames) == 2 and len(found.skipped) == 5
+    study = run_study(folder(pairs), [fake("A", lambda left: None)], Store(None))
+    assert study.rows[0].missing is None and len(study.rows[0].result.frames) == 2 and len(study.skipped) == 5
 
 
 def test_an_interrupt_keeps_whole_frames():
@@ -234,28 +234,30 @@ def test_an_interrupt_keeps_whole_frames():
         if left[0, 0] == 2:
             raise KeyboardInterrupt
 
-    found = run_study(frames(), [fake("A", lambda left: None), fake("B", stop)], Store(None))
-    assert found.interrupted and [len(row.result.frames) for row in found.rows] == [2, 2]
+    study = run_study(frames(), [fake("A", lambda left: None), fake("B", stop)], Store(None))
+    assert study.interrupted and [len(row.result.frames) for row in study.rows] == [2, 2]
 
 
 def test_times_are_medians_after_a_call_to_warm_up():
     calls = []
     ticks = iter([0.0, 0.010, 0.0, 0.050, 0.0, 0.020])
     cell = fake("A", lambda left: calls.append(1))
-    record = study_run.measure(cell, study_run._Loaded(frames(1)[0], True), 3, warm=False, clock=lambda: next(ticks))
+    record = study_run.measure(
+        cell, study_run._LoadedFrame(frames(1)[0], True), 3, warm=False, clock=lambda: next(ticks)
+    )
     assert len(calls) == 4 and record.ms["total"] == pytest.approx(20.0)
 
 
 def test_the_interrupted_command_exits_with_130(pairs, tmp_path, monkeypatch):
     real = study_run.measure
 
-    def stop(configuration, loaded, repeats, **given):
+    def stop(configuration, loaded, repeats, **options):
         if loaded.frame.name == "001":
             raise KeyboardInterrupt
-        return real(configuration, loaded, repeats, **given)
+        return real(configuration, loaded, repeats, **options)
 
     monkeypatch.setattr(study_run, "measure", stop)
-    out, words = tmp_path / "out", ("--method", "S2", "--setting", "original")
+    out, words = tmp_path / "out", ("--method", "S2", "--variant", "original")
     document = run(pairs, out, *words, status=130)
     assert document["interrupted"] is True and document["frames"] == ["000"]
     monkeypatch.setattr(study_run, "measure", real)
@@ -265,7 +267,7 @@ def test_the_interrupted_command_exits_with_130(pairs, tmp_path, monkeypatch):
 def test_killed_twice_it_ends_with_the_same_table(tmp_path):
     pairs = write_pairs(tmp_path / "pairs", 12, (120, 400))
     words = ["--dataset", "folder", "--root", str(pairs), *SMALL, "--method", "S2", "--method", "S4"]
-    words += ["--setting", "original", "--setting", "linear", "--repeats", "25"]
+    words += ["--variant", "original", "--variant", "linear", "--repeats", "25"]
 
     def start(output):
         import stereokit
@@ -300,7 +302,7 @@ def test_killed_twice_it_ends_with_the_same_table(tmp_path):
 @pytest.mark.parametrize(
     ("words", "kind", "message"),
     [
-        (("--setting", "nonsense"), UnknownNameError, "no setting named 'nonsense'"),
+        (("--variant", "nonsense"), UnknownNameError, "no variant named 'nonsense'"),
         (("--method", "S9"), UnknownNameError, "no method named 'S9'"),
         (("--set", "p1"), OptionError, "--set must be KEY=VALUE"),
         (("--set", "colour=1"), OptionError, "no option named 'colour'"),
@@ -333,15 +335,15 @@ def test_an_output_that_is_no_folder_is_refused(pairs, tmp_path):
 def test_training_gives_each_matcher_its_own_weights(tmp_path, monkeypatch):
     calls = []
 
-    def train(home, refiner, *, frames, streets, method, settings, **given):
+    def train(home, refiner, *, frames, streets, method, settings, **options):
         calls.append((refiner, method[0], frames, streets, settings))
         (home / "weights.safetensors").write_bytes(b"not weights")
 
     monkeypatch.setattr(per_matcher, "run_training", train)
     monkeypatch.setattr(datasets, "_SCENE_SIZE", (96, 48))
     datasets._scene.cache_clear()
-    words = ["--dataset", "scenes", "--count", "1", "--method", "S2", "--method", "S4", "--setting", "cnn"]
-    words += ["--setting", "linear", "--train", "--train-set", "steps=5", "-o", str(tmp_path / "out"), *SMALL]
+    words = ["--dataset", "scenes", "--count", "1", "--method", "S2", "--method", "S4", "--variant", "cnn"]
+    words += ["--variant", "linear", "--train", "--train-set", "steps=5", "-o", str(tmp_path / "out"), *SMALL]
     for _ in range(2):  # the second time they are there
         done = CliRunner().invoke(APP, [*words, "--json", "-"])
         assert done.exit_code == 1, (done.output, done.exception)
@@ -365,8 +367,10 @@ def test_frames_that_are_scored_are_not_trained_on(tmp_path):
 
 def test_a_refiner_of_another_package_joins(pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(REFINERS, "_items", {**REFINERS._items, "mine": Linear})
-    linear, mine = run(pairs, tmp_path / "out", "--method", "S2", "--setting", "linear", "--setting", "mine")["results"]
-    assert mine["setting"] == "Mini+mine" and mine["d1"] == linear["d1"]
+    linear, plugin = run(pairs, tmp_path / "out", "--method", "S2", "--variant", "linear", "--variant", "mine")[
+        "results"
+    ]
+    assert plugin["setting"] == "Mini+mine" and plugin["d1"] == linear["d1"]
 
 
 def test_a_setting_that_was_asked_for_and_is_missing_fails_the_run(pairs, tmp_path, monkeypatch):
@@ -374,7 +378,7 @@ def test_a_setting_that_was_asked_for_and_is_missing_fails_the_run(pairs, tmp_pa
         raise ModuleNotFoundError("No module named 'runtime'", name="runtime")
 
     monkeypatch.setattr(REFINERS, "_items", {**REFINERS._items, "cnn": no_runtime})
-    words = ("--method", "S2", "--setting", "linear", "--setting", "cnn")
+    words = ("--method", "S2", "--variant", "linear", "--variant", "cnn")
     document = run(pairs, tmp_path / "out", *words, status=1)
     assert document["results"][1]["missing"] == "needs the package 'runtime', which is not installed"
 
@@ -395,8 +399,8 @@ def test_digests_follow_content(pairs):
     first, second, _ = folder(pairs)
     assert frame_digest(first) == frame_digest(folder(pairs)[0]) != frame_digest(second)
     assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1}) != digest({"a": 1})
-    made = frames(2)
-    assert frame_digest(made[0]) == frame_digest(frames(1)[0]) != frame_digest(made[1])
+    copies = frames(2)
+    assert frame_digest(copies[0]) == frame_digest(frames(1)[0]) != frame_digest(copies[1])
     (pairs / "left" / "000.png").unlink()
     with pytest.raises(FileError, match="no such file"):
         frame_digest(first)
@@ -406,4 +410,4 @@ def test_measure_refuses_unequal_sizes(pairs):
     frame = folder(pairs)[0]
     other = Frame("x", frame.left, lambda: np.zeros((3, 3), np.uint8), occ=frame.occ)
     with pytest.raises(InputError, match="one size"):
-        study_run.measure(fake("A", lambda left: None), study_run._Loaded(other, True), 1)
+        study_run.measure(fake("A", lambda left: None), study_run._LoadedFrame(other, True), 1)

@@ -153,9 +153,9 @@ def test_json_on_standard_output_is_all_that_is_printed(root, tmp_path, trainabl
 def test_a_second_run_with_the_same_options_changes_nothing(root, tmp_path, trainable):
     out = tmp_path / "out"
     trained(root, out, "--frames", "0-1")
-    kept = weights_of(out)
+    weights = weights_of(out)
     trained(root, out, "--frames", "0-1")
-    assert weights_of(out).fingerprint == kept.fingerprint
+    assert weights_of(out).fingerprint == weights.fingerprint
 
 
 def test_the_cache_can_lie_elsewhere_and_changes_nothing(root, tmp_path, trainable):
@@ -170,10 +170,10 @@ def test_the_cache_can_lie_elsewhere_and_changes_nothing(root, tmp_path, trainab
 def test_a_cache_that_was_removed_is_made_again(root, tmp_path, trainable):
     out = tmp_path / "out"
     trained(root, out, "--frames", "0-1")
-    kept, names = weights_of(out), sorted(p.name for p in (out / "cache").iterdir())
+    weights, names = weights_of(out), sorted(p.name for p in (out / "cache").iterdir())
     shutil.rmtree(out / "cache")
     trained(root, out, "--frames", "0-1")
-    assert weights_of(out).fingerprint == kept.fingerprint
+    assert weights_of(out).fingerprint == weights.fingerprint
     assert sorted(p.name for p in (out / "cache").iterdir()) == names
 
 
@@ -192,11 +192,11 @@ def test_start_weights_are_noted_and_used(root, tmp_path, trainable):
     trained(root, tmp_path / "one", "--frames", "0")
     start = tmp_path / "one" / "weights.safetensors"
     trained(root, tmp_path / "two", "--frames", "0", "--start", start, "--set", "learning_rate=0")
-    one, two = weights_of(tmp_path / "one"), weights_of(tmp_path / "two")
-    assert two.notes["start"] == one.fingerprint
-    assert one.notes["start"] is None
-    for name, array in one.arrays.items():
-        np.testing.assert_allclose(two.arrays[name], array, rtol=1e-6, atol=1e-9)
+    first, second = weights_of(tmp_path / "one"), weights_of(tmp_path / "two")
+    assert second.notes["start"] == first.fingerprint
+    assert first.notes["start"] is None
+    for name, array in first.arrays.items():
+        np.testing.assert_allclose(second.arrays[name], array, rtol=1e-6, atol=1e-9)
 
 
 def test_the_papers_preset_and_settings_over_it(root, tmp_path, trainable):
@@ -292,7 +292,7 @@ def test_every_matcher_and_variant_is_there(root, tmp_path, recorded):
     assert list(json.loads(report.read_text())["pooled"]) == ["S2", "census+dt"]
 
 
-def small_scene(seed, width, height, **given):
+def small_scene(seed, width, height, **options):
     """Stand in for a street: a textured pair of disparity 20."""
     rng = np.random.default_rng(seed)
     right = np.repeat(cv2.GaussianBlur(rng.integers(0, 256, (48, 80)).astype(np.uint8), (0, 0), 1.0)[..., None], 3, 2)
@@ -352,7 +352,7 @@ def test_a_training_that_stops_early_writes_its_folder(root, tmp_path, trainable
     from stereokit_refiners.training import loop
 
     scores = iter([1.0, 2.0] * 4)
-    monkeypatch.setattr(loop, "_score", lambda *given: next(scores))
+    monkeypatch.setattr(loop, "_score", lambda *arguments: next(scores))
     report = tmp_path / "r.json"
     trained(root, tmp_path / "out", "--folds", "0/1", "--set", "patience=1", "--set", "steps=50", "--json", report,
             settings=SETTINGS[2:])  # fmt: skip
@@ -373,13 +373,13 @@ def test_a_folder_of_other_data_is_refused(root, tmp_path, trainable, changed):
 def test_a_folder_of_other_settings_is_refused(root, tmp_path, trainable):
     out = tmp_path / "out"
     trained(root, out, "--frames", "0")
-    kept = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    contents = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
     data = ["--dataset", "folder", "--root", root, "--frames", "0"]
     failed(
         run("-o", out, "--refiner", "cnn", *data, *FAST, *SETTINGS, "--set", "seed=5"), "checkpoint", "other settings"
     )
     failed(run("-o", out, "--refiner", "stereovae", *data, *FAST, *SETTINGS), "checkpoint", "other settings")
-    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == kept
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == contents
 
 
 # --- kills ---------------------------------------------------------------------------------------------------------
@@ -444,7 +444,7 @@ def test_a_run_that_was_killed_twice_ends_with_the_weights_of_one_that_was_not(r
 
 
 BAD = [
-    ([], ["dataset", "streets must be given"]),
+    ([], ["dataset", "streets must be set"]),
     (["--dataset", "folder"], ["root must name the folder", "'folder'"]),
     (["--dataset", "kitty2015", "--root", "."], ["no data set named 'kitty2015'", "kitti2015"]),
     (["--dataset", "folder", "--root", "nowhere"], ["root must be a folder", "nowhere"]),
@@ -484,8 +484,8 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("given", "parts"), BAD, ids=[" ".join(given) or "nothing" for given, _ in BAD])
-def test_bad_input_ends_with_one_line_and_writes_nothing(given, parts, root, tmp_path, monkeypatch, trainable):
+@pytest.mark.parametrize(("arguments", "parts"), BAD, ids=[" ".join(arguments) or "nothing" for arguments, _ in BAD])
+def test_bad_input_ends_with_one_line_and_writes_nothing(arguments, parts, root, tmp_path, monkeypatch, trainable):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.safetensors").write_text("no weights")
     for side in ("left", "right"):
@@ -493,11 +493,11 @@ def test_bad_input_ends_with_one_line_and_writes_nothing(given, parts, root, tmp
         cv2.imwrite(str(tmp_path / "bare" / side / "000000.png"), np.zeros((48, 80), np.uint8))
     before = sorted(tmp_path.rglob("*"))
     words = {"DATA": ["--dataset", "folder", "--root", str(root)], "BARE": ["--dataset", "folder", "--root", "bare"]}
-    arguments = [part for word in given for part in words.get(word, [word])]
-    extra = [] if "--refiner" in given else ["--refiner", "cnn"]
-    fast = [*(["--method", "S2"] if "--method" not in given else []),
-            *(["--variants", "1"] if "--variants" not in given else []),
-            *(["--max-disparity", "32"] if "--max-disparity" not in given else [])]  # fmt: skip
+    arguments = [part for word in arguments for part in words.get(word, [word])]
+    extra = [] if "--refiner" in arguments else ["--refiner", "cnn"]
+    fast = [*(["--method", "S2"] if "--method" not in arguments else []),
+            *(["--variants", "1"] if "--variants" not in arguments else []),
+            *(["--max-disparity", "32"] if "--max-disparity" not in arguments else [])]  # fmt: skip
     keys = {arguments[k + 1].partition("=")[0] for k, word in enumerate(arguments) if word == "--set"}
     settings = [part for s in ["steps=4", *TINY] if s.partition("=")[0] not in keys for part in ("--set", s)]
     failed(run("-o", "out", *extra, *fast, *settings, *arguments), *parts)
@@ -549,23 +549,23 @@ def test_frames_become_pairs():
 
 def test_a_street_from_the_cache_is_the_street(tmp_path, monkeypatch):
     monkeypatch.setattr(training_pairs, "generate", small_scene)
-    made = scene_pair(FIRST_SEED, tmp_path / "not" / "there")
+    first = scene_pair(FIRST_SEED, tmp_path / "not" / "there")
     fresh = scene_pair(FIRST_SEED)
     monkeypatch.setattr(training_pairs, "generate", None)
-    held = scene_pair(FIRST_SEED, tmp_path / "not" / "there")
-    for other in (fresh, held):
-        assert other.digest == made.digest
+    second = scene_pair(FIRST_SEED, tmp_path / "not" / "there")
+    for other in (fresh, second):
+        assert other.digest == first.digest
         assert other.name == f"street-{FIRST_SEED}"
-    assert np.isnan(made.noc[:, :20]).all() and (made.noc[:, 20:] == 20).all()
-    assert (made.occ == 20).all()
-    assert made.left.ndim == 2 and made.left.dtype == np.uint8
+    assert np.isnan(first.noc[:, :20]).all() and (first.noc[:, 20:] == 20).all()
+    assert (first.occ == 20).all()
+    assert first.left.ndim == 2 and first.left.dtype == np.uint8
 
 
 def test_streets_differ_by_seed_in_size_and_camera(monkeypatch):
     seen = []
 
-    def generate(seed, width, height, **given):
-        seen.append((width, height, *given.values()))
+    def generate(seed, width, height, **options):
+        seen.append((width, height, *options.values()))
         return small_scene(seed, width, height)
 
     monkeypatch.setattr(training_pairs, "generate", generate)

@@ -85,9 +85,9 @@ def test_evaluate_gives_them_to_the_rows_that_need_them():
 
 def test_the_study_gives_them_to_the_settings_that_need_them():
     settings = ["linear", "original", "cnn", "stereokit"]
-    bare = {cell.setting: cell for cell in build(["S2"], settings, {})}
+    bare = {cell.variant: cell for cell in build(["S2"], settings, {})}
     assert "needs weights" in bare["cnn"].missing
-    cells = {cell.setting: cell for cell in build(["S2"], settings, {"weights": "kitti"})}
+    cells = {cell.variant: cell for cell in build(["S2"], settings, {"weights": "kitti"})}
     assert [cell.missing for cell in cells.values()] == [None] * 4
     assert cells["stereokit"].identity == bare["stereokit"].identity
     assert cells["cnn"].identity["refiner"]["weights"]

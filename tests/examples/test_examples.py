@@ -141,9 +141,9 @@ def test_the_refiner_follows_the_image_and_keeps_the_contract(monkeypatch):
     coarse = np.full((3, 5), 2, np.float32)
     coarse[:, 3:] = 7
     coarse[0, 0] = np.nan
-    found = Guided(pull=1.0)(stereokit.Disparity(coarse, ~np.isnan(coarse)), left)
-    np.testing.assert_array_equal(found.disparity[2:, :5], 4)
-    np.testing.assert_array_equal(found.disparity[2:, 5:], 14)
-    assert np.isnan(found.disparity[:2, :2]).all() and not found.valid[:2, :2].any() and found.valid[2:].all()
+    result = Guided(pull=1.0)(stereokit.Disparity(coarse, ~np.isnan(coarse)), left)
+    np.testing.assert_array_equal(result.disparity[2:, :5], 4)
+    np.testing.assert_array_equal(result.disparity[2:, 5:], 14)
+    assert np.isnan(result.disparity[:2, :2]).all() and not result.valid[:2, :2].any() and result.valid[2:].all()
     with pytest.raises(stereokit.OptionError, match="pull must be at least 0 grey levels, got -1"):
         Guided(pull=-1)

@@ -53,7 +53,7 @@ def run_part(
     run: Callable[[int, int], int],
     seed: int,
     numbers: Iterable[int],
-    wanted: int,
+    goal: int,
     until: float,
     watch: Watch,
 ) -> int:
@@ -61,7 +61,7 @@ def run_part(
     start = time.monotonic()
     count = findings = 0
     for number in numbers:
-        if count >= wanted or time.monotonic() > until:
+        if count >= goal or time.monotonic() > until:
             break
         command = f"(cd tests && ../.venv/bin/python -m fuzz --seed {seed} --only {name}:{number})"
         watch.begin(command)
@@ -78,10 +78,10 @@ def run_part(
                 f"finding: {type(error).__name__}: {message}\n  at {place.filename}:{place.lineno}\n  repeat: {command}"
             )
             sys.stdout.flush()
-            if wanted == 1:
+            if goal == 1:
                 traceback.print_exc()
     seconds = time.monotonic() - start
-    print(f"{name}: {count} of {wanted}, {findings} findings, {seconds:.0f} s", flush=True)
+    print(f"{name}: {count} of {goal}, {findings} findings, {seconds:.0f} s", flush=True)
     return findings
 
 
@@ -105,9 +105,9 @@ def main() -> int:
             return min(1, run_part(name, parts[name][0], chosen.seed, [int(number)], 1, float("inf"), watch))
         print(f"seed {chosen.seed}, {chosen.files} files, {chosen.calls} calls, {chosen.minutes:g} minutes", flush=True)
         findings = 0
-        for name, (run, wanted, share) in parts.items():
+        for name, (run, goal, share) in parts.items():
             until = start + 60 * chosen.minutes * share
-            findings += run_part(name, run, chosen.seed, numbers_from(0), wanted, until, watch)
+            findings += run_part(name, run, chosen.seed, numbers_from(0), goal, until, watch)
     return min(1, findings)
 
 

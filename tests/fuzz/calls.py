@@ -160,13 +160,13 @@ def options_of(rng: Rng) -> dict[str, Any]:
     return options
 
 
-def check_map(found: Any, shape: tuple[int, ...], options: dict[str, Any]) -> None:
+def check_map(result: Any, shape: tuple[int, ...], options: dict[str, Any]) -> None:
     """Check what holds of any result."""
-    check(isinstance(found, stereokit.Disparity), "the result is no Disparity")
-    check(found.disparity.dtype == np.float32 and found.disparity.shape == shape[:2], "type or shape of the map")
-    check(found.valid.dtype == np.bool_ and found.valid.shape == shape[:2], "type or shape of what is valid")
+    check(isinstance(result, stereokit.Disparity), "the result is no Disparity")
+    check(result.disparity.dtype == np.float32 and result.disparity.shape == shape[:2], "type or shape of the map")
+    check(result.valid.dtype == np.bool_ and result.valid.shape == shape[:2], "type or shape of what is valid")
     low, high = options["min_disparity"], options["max_disparity"]
-    maps = [found.disparity] + ([] if found.right is None else [found.right])
+    maps = [result.disparity] + ([] if result.right is None else [result.right])
     check(len(maps) == 1 + bool(options.get("right", False)), "the right view's map")
     high_end = high - 1 if options.get("scale", 1) == 1 else max(2 * (-(-high // 2) - 1), low)
     for values in maps:
@@ -175,11 +175,11 @@ def check_map(found: Any, shape: tuple[int, ...], options: dict[str, Any]) -> No
         if options.get("fill", "nearest") is not None:
             check(known.size == values.size, "gaps in a filled map")
     if options.get("confidence"):
-        check(found.confidence is not None and found.confidence.shape == shape[:2], "no confidence")
-        check(found.confidence.min() >= 0 and found.confidence.max() <= 1, "confidence out of range")
-        check(not found.confidence[~found.valid].any(), "confidence of what is not valid")
+        check(result.confidence is not None and result.confidence.shape == shape[:2], "no confidence")
+        check(result.confidence.min() >= 0 and result.confidence.max() <= 1, "confidence out of range")
+        check(not result.confidence[~result.valid].any(), "confidence of what is not valid")
     else:
-        check(found.confidence is None, "a confidence that nobody asked for")
+        check(result.confidence is None, "a confidence that nobody asked for")
 
 
 def same(a: Any, b: Any) -> bool:
@@ -192,14 +192,14 @@ def good_match(rng: Rng) -> int:
     left, right = pair(rng, shape_of(rng))
     before = left.copy(), right.copy()
     options = options_of(rng)
-    found = stereokit.Matcher(**options)(left, right)
-    check_map(found, left.shape, options)
+    result = stereokit.Matcher(**options)(left, right)
+    check_map(result, left.shape, options)
     again = stereokit.Matcher(**{**options, "threads": 1})(left, right)
     for name in ("disparity", "valid", "confidence", "right"):
-        check(same(getattr(found, name), getattr(again, name)), f"{name} depends on the threads or the time")
+        check(same(getattr(result, name), getattr(again, name)), f"{name} depends on the threads or the time")
     plain = {name: value for name, value in options.items() if name != "right"}
     simple = stereokit.match(np.ascontiguousarray(left), np.ascontiguousarray(right), **plain)
-    check(same(found.disparity, simple), "match differs from Matcher")
+    check(same(result.disparity, simple), "match differs from Matcher")
     check(same(left, before[0]) and same(right, before[1]), "an image was modified")
     return 3
 
@@ -214,9 +214,9 @@ def nonsense_match(rng: Rng) -> int:
     images = [left, right]
     if rng.random() < 0.5:
         images[rng.integers(2)] = bad_image(rng, left)
-    found = refused(lambda: stereokit.Matcher(**options)(*images))
-    if found is not None:
-        check(isinstance(found, stereokit.Disparity) and found.disparity.shape == np.shape(images[0])[:2], "no map")
+    error = refused(lambda: stereokit.Matcher(**options)(*images))
+    if error is not None:
+        check(isinstance(error, stereokit.Disparity) and error.disparity.shape == np.shape(images[0])[:2], "no map")
     refused(lambda: stereokit.match(*images, **options))
     return 2
 
@@ -353,8 +353,8 @@ def several(rng: Rng) -> int:
     options = options_of(rng)
     matcher = stereokit.Matcher(**options)
     pairs = [pair(rng, shape_of(rng)) for _ in range(3)]
-    found = list(matcher.map(pairs))
-    for (left, right), result in zip(pairs, found, strict=True):
+    results = list(matcher.map(pairs))
+    for (left, right), result in zip(pairs, results, strict=True):
         check_map(result, left.shape, options)
         check(same(result.disparity, matcher(left, right).disparity), "map differs from a call")
     return 6

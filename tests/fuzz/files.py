@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -17,8 +18,9 @@ import stereokit
 from stereokit.calibration import read_calibration
 from stereokit.errors import StereokitError
 from stereokit.large.sources import open_source
+from stereokit.rig import Camera, StereoRig, read_rig
 from stereokit_evaluation.batch.pairs import list_pairs
-from stereokit_evaluation.batch.store import held
+from stereokit_evaluation.batch.store import open_output
 from stereokit_refiners.weights import read as read_weights
 
 __all__ = ["run_file"]
@@ -42,6 +44,50 @@ def encoded(suffix: str, array: np.ndarray) -> bytes:
     return bytes(cv2.imencode(suffix, array)[1])
 
 
+KALIBR = b"""cam0:
+  camera_model: pinhole
+  intrinsics: [461.6, 460.1, 362.7, 246.0]
+  distortion_model: radtan
+  distortion_coeffs: [-0.27, 0.06, 0.0008, 0.0001]
+  resolution: [752, 480]
+cam1:
+  camera_model: pinhole
+  intrinsics: [460.6, 461.1, 360.7, 244.0]
+  distortion_model: radtan
+  distortion_coeffs: [-0.26, 0.05, 0.0007, 0.0002]
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.11]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  resolution: [752, 480]
+"""
+ROS = b"""image_width: 640
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [700, 0, 320, 0, 700, 240, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}
+projection_matrix: {rows: 3, cols: 4, data: [700, 0, 320, -70, 0, 700, 240, 0, 0, 0, 1, 0]}
+"""
+ZED = (
+    b"[LEFT_CAM_HD]\nfx=700\nfy=700\ncx=640\ncy=360\nk1=-0.17\n[RIGHT_CAM_HD]\nfx=701\nfy=700\ncx=630\ncy=361\n"
+    b"[STEREO]\nBaseline=120\nTY=0.1\nRX_HD=0.001\n"
+)
+
+
+@cache
+def rigs() -> dict[str, bytes]:
+    """Return a rig as it is saved, by suffix."""
+    lens = Camera([[700, 0, 320], [0, 700, 240], [0, 0, 1]], (-0.2, 0.1, 0, 0, 0), width=640, height=480)
+    content = {}
+    with TemporaryDirectory() as folder:
+        for suffix in (".yml", ".xml", ".json"):
+            path = Path(folder, f"rig{suffix}")
+            StereoRig(lens, lens, np.eye(3), (-0.1, 0, 0)).save(path)
+            content[suffix] = path.read_bytes()
+    return content
+
+
 @cache
 def samples() -> dict[str, tuple[bytes, ...]]:
     """Return good files by suffix."""
@@ -63,7 +109,10 @@ def samples() -> dict[str, tuple[bytes, ...]]:
         ".tiff": (encoded(".tiff", disparity), encoded(".tiff", grey)),
         ".jpg": (encoded(".jpg", grey),),
         ".pgm": (encoded(".pgm", grey),),
-        ".json": (json.dumps(camera).encode(),),
+        ".json": (json.dumps(camera).encode(), rigs()[".json"]),
+        ".yml": (rigs()[".yml"], KALIBR, ROS),
+        ".xml": (rigs()[".xml"],),
+        ".conf": (ZED,),
         ".txt": (middlebury.encode() + b"width=17\nheight=12\nndisp=64\n", kitti.encode()),
         ".csv": (b"left,right\na.png,b.png\nc.png,d.png,name\n", b"a.png\tb.png\nc.png\td.png\tsub/name\n"),
         ".safetensors": (weights.read_bytes(),),
@@ -72,7 +121,7 @@ def samples() -> dict[str, tuple[bytes, ...]]:
 
 
 def _manifest(path: Path) -> None:
-    with held(path.parent, {"format": 1}, ".png", lambda name: True, False):
+    with open_output(path.parent, {"format": 1}, ".png", lambda name: True, False):
         pass
 
 
@@ -83,8 +132,11 @@ READERS: dict[str, tuple[Callable[[Path], Any], ...]] = {
     ".tiff": (stereokit.read_disparity, stereokit.read_image, lambda path: open_source("left", path)),
     ".jpg": (stereokit.read_image,),
     ".pgm": (stereokit.read_image,),
-    ".json": (read_calibration,),
-    ".txt": (read_calibration, list_pairs),
+    ".json": (read_calibration, read_rig),
+    ".yml": (read_rig, read_calibration),
+    ".xml": (read_rig, read_calibration),
+    ".conf": (lambda path: read_rig(path, size=(1280, 720)),),
+    ".txt": (read_calibration, read_rig, list_pairs),
     ".csv": (list_pairs,),
     ".safetensors": (read_weights,),
     "manifest.json": (_manifest,),
@@ -96,27 +148,27 @@ def mutated(rng: Rng, content: bytes) -> bytes:
     data = bytearray(content)
     near = min(len(data), 2000) if rng.random() < 0.7 else len(data)  # headers are where it matters
     for _ in range(rng.integers(1, 5)):
-        at = int(rng.integers(0, max(near, 1)))
+        offset = int(rng.integers(0, max(near, 1)))
         kind = rng.integers(9)
         if kind == 0 and data:
-            data[at % len(data)] ^= 1 << int(rng.integers(8))
+            data[offset % len(data)] ^= 1 << int(rng.integers(8))
         elif kind == 1 and data:
-            data[at % len(data)] = int(rng.choice([0, 255, 10, 32, 34, 39, 40, 44, 58, 91, 123]))
+            data[offset % len(data)] = int(rng.choice([0, 255, 10, 32, 34, 39, 40, 44, 58, 91, 123]))
         elif kind == 2:
-            del data[at : at + int(rng.integers(1, 40))]
+            del data[offset : offset + int(rng.integers(1, 40))]
         elif kind == 3:
-            data = data[:at]
+            data = data[:offset]
         elif kind == 4:
-            data[at:at] = rng.bytes(int(rng.integers(1, 40)))
+            data[offset:offset] = rng.bytes(int(rng.integers(1, 40)))
         elif kind == 5:
-            data[at:at] = data[at : at + int(rng.integers(1, 100))]
+            data[offset:offset] = data[offset : offset + int(rng.integers(1, 100))]
         elif kind == 6:
             value = int(rng.choice([0, 1, 2**15, 2**31 - 1, 2**32 - 1]))
-            data[at : at + 4] = struct.pack(str(rng.choice(["<I", ">I"])), value)
+            data[offset : offset + 4] = struct.pack(str(rng.choice(["<I", ">I"])), value)
         elif kind == 7:
-            data[at:at] = NUMBERS[rng.integers(len(NUMBERS))]
+            data[offset:offset] = NUMBERS[rng.integers(len(NUMBERS))]
         else:
-            data[at:at] = bytes(rng.choice([b"[", b"{", b'"', b"(", b"\n", b"\0", b"="])) * int(
+            data[offset:offset] = bytes(rng.choice([b"[", b"{", b'"', b"(", b"\n", b"\0", b"="])) * int(
                 rng.choice([1, 3, 20000])
             )
     return bytes(data)

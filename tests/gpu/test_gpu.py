@@ -75,9 +75,9 @@ def test_paths_of_a_full_image(queue, paths, count):
 def test_matchers_on_full_images(method):
     pair = _pair()
     options = {"max_disparity": 128, "confidence": True, "right": True}
-    found, want = (Matcher(method, device=device, **options)(*pair) for device in ("cuda", "cpu"))
+    result, want = (Matcher(method, device=device, **options)(*pair) for device in ("cuda", "cpu"))
     for name in ("disparity", "valid", "confidence", "right"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(want, name), name)
+        np.testing.assert_array_equal(getattr(result, name), getattr(want, name), name)
 
 
 def test_calls_from_many_threads():
@@ -85,8 +85,8 @@ def test_calls_from_many_threads():
     pair = _pair((120, 300))
     want = matcher(*pair).disparity
     with ThreadPoolExecutor(4) as executor:
-        for found in executor.map(lambda _: matcher(*pair).disparity, range(16)):
-            np.testing.assert_array_equal(found, want)
+        for result in executor.map(lambda _: matcher(*pair).disparity, range(16)):
+            np.testing.assert_array_equal(result, want)
 
 
 def test_tensors_go_in_and_out_without_a_copy():
@@ -98,10 +98,10 @@ def test_tensors_go_in_and_out_without_a_copy():
     stream = torch.cuda.Stream()
     with torch.cuda.stream(stream):
         tensors = torch.as_tensor(left, device="cuda"), torch.as_tensor(right, device="cuda")
-        found = matcher.on_device(*tensors, stream=stream)
-        disparity = torch.as_tensor(found.disparity, device="cuda")
+        result = matcher.on_device(*tensors, stream=stream)
+        disparity = torch.as_tensor(result.disparity, device="cuda")
     stream.synchronize()
-    assert disparity.data_ptr() == found.disparity.__cuda_array_interface__["data"][0]
+    assert disparity.data_ptr() == result.disparity.__cuda_array_interface__["data"][0]
     np.testing.assert_array_equal(disparity.cpu().numpy(), matcher(left, right).disparity)
 
 
@@ -120,10 +120,10 @@ def test_maps_are_refined_where_they_are(refiner):
     stream = torch.cuda.Stream()
     with torch.cuda.stream(stream):
         tensors = [torch.as_tensor(image, device="cuda") for image in pair]
-        found = Matcher("S4", device="cuda", **options).on_device(*tensors, stream=stream)
+        result = Matcher("S4", device="cuda", **options).on_device(*tensors, stream=stream)
     stream.synchronize()
-    np.testing.assert_allclose(found.disparity.cpu().numpy(), want.disparity, rtol=0, atol=0.05)
-    np.testing.assert_array_equal(found.valid.cpu().numpy() != 0, want.valid)
+    np.testing.assert_allclose(result.disparity.cpu().numpy(), want.disparity, rtol=0, atol=0.05)
+    np.testing.assert_array_equal(result.valid.cpu().numpy() != 0, want.valid)
 
 
 def test_too_large_a_volume_names_what_is_needed_and_free():

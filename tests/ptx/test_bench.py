@@ -13,8 +13,8 @@ from ptx.interpreter.emulated import EmulatedQueue
 from stereokit import matching
 from stereokit.cli.app import app
 from stereokit.cuda import pipeline as cuda_pipeline
+from stereokit_evaluation.bench import baselines
 from stereokit_evaluation.bench import gpu as gpu_times
-from stereokit_evaluation.bench import peers
 from stereokit_evaluation.commands import bench as command
 
 SIZE = "40x10x16"
@@ -42,7 +42,7 @@ def waits(monkeypatch) -> list[int]:
     monkeypatch.setattr(gpu_times, "require_device", lambda: None)
     monkeypatch.setattr(gpu_times, "_resident", lambda image: image.copy())
     monkeypatch.setattr(gpu_times, "_wait", lambda: launches.append(sum(len(queue.launches) for queue in queues)))
-    monkeypatch.setattr(command, "peers", lambda: [peers.THREE_WAY])
+    monkeypatch.setattr(command, "baselines", lambda: [baselines.THREE_WAY])
     monkeypatch.setattr(command, "describe", lambda: "an interpreter")
     return launches
 
@@ -56,7 +56,7 @@ def test_host_and_device_images_and_a_peer(waits):
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout)
     rows = {row["contender"]: row for row in report["results"]}
-    assert list(rows) == ["S2 census+sgm, GPU, host images", "S2 census+sgm, GPU, device images", peers.THREE_WAY]
+    assert list(rows) == ["S2 census+sgm, GPU, host images", "S2 census+sgm, GPU, device images", baselines.THREE_WAY]
     assert [row["kind"] for row in rows.values()] == ["method", "method", "peer"]
     assert all(row["runs"] == 2 and row["median_ms"] > 0 and row["x_3way"] > 0 for row in rows.values())
     assert report["options"]["device"] == "an interpreter" and report["memory"] == report["first_call"] == []
@@ -82,5 +82,5 @@ def test_calls_give_the_map_of_the_cpu(waits):
         call = build(name, 16, 1)
         for _ in range(2):
             np.testing.assert_array_equal(np.asarray(call(left, right)), want)
-    peer = build(peers.THREE_WAY, 16, 1)
+    peer = build(baselines.THREE_WAY, 16, 1)
     assert peer(left, right).shape == left.shape

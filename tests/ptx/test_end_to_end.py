@@ -90,6 +90,22 @@ def test_nan_half_size_and_the_right_view(queues):
     _same(left, right, "S2", scale=0.5, right=True, speckle=0.02, fill="background", paths=8)
 
 
+@pytest.mark.parametrize("options", [{"confidence": True, "smooth": 0}, {"scale": 0.5}], ids=["full", "half"])
+@pytest.mark.parametrize("method", ["S2", "S4"])
+def test_masks_borders_and_areas_without_texture(queues, method, options):
+    left, right = _pair(18, 48)
+    for image in (left, right):
+        image[:16, 14:38] = 120
+    left[:, :5] = 0  # a black border
+    masks = {"mask": np.arange(48)[None] + 0 * left < 44, "right_mask": np.arange(48)[None] + 0 * left > 2}
+    want = Matcher(method, device="cpu", **LEVELS, **options)(left, right, **masks)
+    result = Matcher(method, device="cuda", **LEVELS, **options)(left, right, **masks)
+    for name in ("disparity", "valid", "confidence"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(want, name), name)
+    assert result.valid.any() and not result.valid[:6, 24:28].any() and np.isfinite(result.disparity[:6, 24:28]).all()
+    assert np.isnan(result.disparity[:, :5]).all() and np.isnan(result.disparity[:, 44:]).all()
+
+
 def test_what_is_left_out(queues):
     left, right = _pair(7, 24)
     _same(left, right, "S2", smooth=0, smp=False, speckle=0, fill=None, median=0, subpixel=False, uniqueness=10)

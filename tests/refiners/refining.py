@@ -14,10 +14,8 @@ from stereokit_refiners.weights import NETWORKS, WeightFile, find, write
 
 NAN = np.nan
 NAMES = tuple(name for name, network in NETWORKS.items() if "disparity" in network.inputs)
-LEARNED = [name for name in ("openvino", "onnxruntime", "torch") if importlib.util.find_spec(name)]
-needs_backend = pytest.mark.skipif(
-    not LEARNED or not importlib.util.find_spec("safetensors"), reason="needs a runtime for networks, and safetensors"
-)
+LEARNED = [*(name for name in ("openvino", "onnxruntime", "torch") if importlib.util.find_spec(name)), "opencv"]
+"""Runtimes of networks that are installed."""
 
 
 def random_arrays(name, seed=0, last=0.05):
@@ -43,9 +41,9 @@ def random_content(name, seed=0, output_mode="residual", ranges=None, last=0.05)
     return WeightFile(name, output_mode, random_arrays(name, seed, last), ranges or {}, {"note": "random"})
 
 
-def weight_file(folder, name, seed=0, **given):
+def weight_file(folder, name, seed=0, **arguments):
     path = folder / f"{name}-{seed}.safetensors"
-    write(path, random_content(name, seed, **given))
+    write(path, random_content(name, seed, **arguments))
     return str(path)
 
 

@@ -103,12 +103,12 @@ CHANGES = {
 @pytest.mark.parametrize("sparse", [0.25, 1.0])
 def test_inputs_are_not_modified_and_the_same_random_state_is_the_same_pair(change, sparse):
     views = scene(CAR, POLE, sparse=sparse)
-    kept = copied(views)
+    original = copied(views)
     for seed in range(4):
-        found = change(np.random.default_rng(seed), views)
-        assert_views(found, found.left.shape)
-        assert_equal(change(np.random.default_rng(seed), views), found)
-        assert_equal(views, kept)
+        actual = change(np.random.default_rng(seed), views)
+        assert_views(actual, actual.left.shape)
+        assert_equal(change(np.random.default_rng(seed), views), actual)
+        assert_equal(views, original)
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
@@ -119,9 +119,9 @@ def test_pairs_without_any_truth_have_none_afterwards(change, size):
         *(rng.integers(0, 256, size).astype(np.uint8) for _ in range(2)), *np.full((2, *size), NAN, np.float32)
     )
     for seed in range(3):
-        found = change(np.random.default_rng(seed), views)
-        assert np.isnan(found.noc).all() and np.isnan(found.occ).all()
-        assert_views(found, found.left.shape)
+        actual = change(np.random.default_rng(seed), views)
+        assert np.isnan(actual.noc).all() and np.isnan(actual.occ).all()
+        assert_views(actual, actual.left.shape)
 
 
 # --- mirrored ------------------------------------------------------------------------------------------------------
@@ -130,21 +130,21 @@ def test_pairs_without_any_truth_have_none_afterwards(change, size):
 def mirrored_by_loops(noc):
     """Return the truth of the right view behind the mirror: the nearest, then what opened by a pixel; flipped."""
     height, width = noc.shape
-    found = [[None] * width for _ in range(height)]
+    actual = [[None] * width for _ in range(height)]
     for y in range(height):
         for x in range(width):
             d = float(noc[y, x])
             if d != d:
                 continue
             there = round(x - d)
-            if 0 <= there < width and (found[y][there] is None or d > found[y][there]):
-                found[y][there] = d
+            if 0 <= there < width and (actual[y][there] is None or d > actual[y][there]):
+                actual[y][there] = d
     out = np.full(noc.shape, NAN, np.float32)
     for y in range(height):
         for x in range(width):
-            value = found[y][x]
+            value = actual[y][x]
             if value is None and 0 < x < width - 1:
-                before, after = found[y][x - 1], found[y][x + 1]
+                before, after = actual[y][x - 1], actual[y][x + 1]
                 if before is not None and after is not None and abs(before - after) < 1.5:
                     value = 0.5 * (before + after)
             if value is not None:
@@ -165,17 +165,17 @@ def test_mirrored_truth_against_loops(size, spread, known):
     rng = np.random.default_rng([*size, spread])
     noc = (3 + spread * rng.random(size)).astype(np.float32)
     noc[rng.random(size) > known] = NAN
-    found = mirrored(views_of(noc))
-    np.testing.assert_allclose(found.noc, mirrored_by_loops(noc), rtol=1e-6)
-    np.testing.assert_array_equal(found.occ, found.noc)  # what only the new left camera sees, nobody knows
+    actual = mirrored(views_of(noc))
+    np.testing.assert_allclose(actual.noc, mirrored_by_loops(noc), rtol=1e-6)
+    np.testing.assert_array_equal(actual.occ, actual.noc)  # what only the new left camera sees, nobody knows
 
 
 def test_mirrored_views_change_sides():
     views = scene(CAR)
-    found = mirrored(views)
-    np.testing.assert_array_equal(found.left, views.right[:, ::-1])
-    np.testing.assert_array_equal(found.right, views.left[:, ::-1])
-    twice = mirrored(found)
+    actual = mirrored(views)
+    np.testing.assert_array_equal(actual.left, views.right[:, ::-1])
+    np.testing.assert_array_equal(actual.right, views.left[:, ::-1])
+    twice = mirrored(actual)
     np.testing.assert_array_equal(twice.left, views.left)
     np.testing.assert_array_equal(twice.right, views.right)
 
@@ -183,18 +183,18 @@ def test_mirrored_views_change_sides():
 @pytest.mark.parametrize("boxes", [(), (CAR,), (CAR, POLE)])
 def test_a_mirrored_scene_is_seen_alike_by_both_cameras(boxes):
     views = scene(*boxes, sparse=1)
-    found = mirrored(views)
-    assert_photo_consistent(found)
+    actual = mirrored(views)
+    assert_photo_consistent(actual)
     for box in boxes:
         y, x = np.nonzero(views.noc == box.d)
-        np.testing.assert_array_equal(found.noc[y, SIZE[1] - 1 - (x - box.d)], box.d)
-    assert np.isfinite(found.noc).sum() == np.isfinite(views.noc).sum()  # whole disparities: no cracks, no loss
+        np.testing.assert_array_equal(actual.noc[y, SIZE[1] - 1 - (x - box.d)], box.d)
+    assert np.isfinite(actual.noc).sum() == np.isfinite(views.noc).sum()  # whole disparities: no cracks, no loss
 
 
 def test_a_shift_is_the_same_shift_from_the_other_side():
-    found = mirrored(scene(sparse=1))
-    assert (found.noc[:, FAR:] == FAR).all()
-    assert np.isnan(found.noc[:, :FAR]).all()
+    actual = mirrored(scene(sparse=1))
+    assert (actual.noc[:, FAR:] == FAR).all()
+    assert np.isnan(actual.noc[:, :FAR]).all()
 
 
 def row(*values):
@@ -216,14 +216,14 @@ def row(*values):
     ids=["collision", "three", "left", "right", "border", "opened", "slanted", "edge"],
 )
 def test_where_pixels_go(noc, expected):
-    found = mirrored(views_of(noc)).noc[:, ::-1]
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    actual = mirrored(views_of(noc)).noc[:, ::-1]
+    np.testing.assert_allclose(actual, expected, rtol=1e-6)
 
 
 # --- moved objects -------------------------------------------------------------------------------------------------
 
 
-def copies_of(views, found, box):
+def copies_of(views, actual, box):
     """Return (shift, flipped) of every place where the left view shows the whole box."""
     places = []
     for flipped in (False, True):
@@ -231,7 +231,7 @@ def copies_of(views, found, box):
         y, x = np.nonzero(origin.noc == box.d)
         top, left = y.min(), x.min()
         part = origin.left[top : y.max() + 1, left : x.max() + 1]
-        strip = found.left[top : y.max() + 1]
+        strip = actual.left[top : y.max() + 1]
         for at in range(strip.shape[1] - part.shape[1] + 1):
             if np.array_equal(strip[:, at : at + part.shape[1]], part):
                 places.append((at - left, flipped))
@@ -266,8 +266,8 @@ def test_at_most_as_many_copies_as_are_allowed():
     assert_equal(copy_paste(np.random.default_rng(0), views, most=0), views)
     counts = set()
     for seed in range(12):
-        found = copy_paste(np.random.default_rng(seed), views, most=1)
-        counts.add(len(set(copies_of(views, found, CAR)) - {(0, False)}))
+        actual = copy_paste(np.random.default_rng(seed), views, most=1)
+        counts.add(len(set(copies_of(views, actual, CAR)) - {(0, False)}))
     assert counts == {0, 1}
 
 
@@ -277,18 +277,18 @@ def test_after_moving_both_cameras_still_see_the_same(boxes):
     assert_photo_consistent(views)
     changed = 0
     for seed in range(12):
-        found = copy_paste(np.random.default_rng(seed), views)
-        assert_views(found, SIZE)
-        assert_photo_consistent(found)
-        changed += not same(found, views)
+        actual = copy_paste(np.random.default_rng(seed), views)
+        assert_views(actual, SIZE)
+        assert_photo_consistent(actual)
+        changed += not same(actual, views)
     assert changed >= 6
 
 
 def test_a_copy_stands_on_the_same_rows_at_its_disparity_in_both_views():
     views, moved = scene(CAR), 0
     for seed in range(16):
-        found = copy_paste(np.random.default_rng(seed), views, most=1)
-        new = set(copies_of(views, found, CAR)) - {(0, False)}
+        actual = copy_paste(np.random.default_rng(seed), views, most=1)
+        new = set(copies_of(views, actual, CAR)) - {(0, False)}
         if not new:  # none was drawn, or it reaches out of the image
             continue
         ((shift, flipped),) = new
@@ -296,22 +296,22 @@ def test_a_copy_stands_on_the_same_rows_at_its_disparity_in_both_views():
         origin = mirrored(views) if flipped else views
         y, x = np.nonzero(origin.noc == CAR.d)
         assert (y.min(), y.max()) == (CAR.y, CAR.y + CAR.height - 1)
-        np.testing.assert_array_equal(found.left[y, x + shift], origin.left[y, x])
+        np.testing.assert_array_equal(actual.left[y, x + shift], origin.left[y, x])
         there = x + shift - CAR.d
         seen = there >= 0
-        np.testing.assert_array_equal(found.right[y[seen], there[seen]], origin.right[y[seen], (x - CAR.d)[seen]])
-        assert (found.occ[y, x + shift] == CAR.d).all()
-        assert (found.noc[y[seen], (x + shift)[seen]] == CAR.d).all()
-        assert np.isnan(found.noc[y[~seen], (x + shift)[~seen]]).all()
-        rows = np.nonzero((views.left != found.left).any(axis=1))[0]
+        np.testing.assert_array_equal(actual.right[y[seen], there[seen]], origin.right[y[seen], (x - CAR.d)[seen]])
+        assert (actual.occ[y, x + shift] == CAR.d).all()
+        assert (actual.noc[y[seen], (x + shift)[seen]] == CAR.d).all()
+        assert np.isnan(actual.noc[y[~seen], (x + shift)[~seen]]).all()
+        rows = np.nonzero((views.left != actual.left).any(axis=1))[0]
         assert CAR.y <= rows.min() and rows.max() < CAR.y + CAR.height
     assert moved >= 5
 
 
 def test_copies_show_both_the_object_and_its_mirror_image():
     views = scene(CAR)
-    found = [copy_paste(np.random.default_rng(seed), views, most=1) for seed in range(20)]
-    sides = {flipped for one in found for shift, flipped in set(copies_of(views, one, CAR)) - {(0, False)}}
+    actual = [copy_paste(np.random.default_rng(seed), views, most=1) for seed in range(20)]
+    sides = {flipped for one in actual for shift, flipped in set(copies_of(views, one, CAR)) - {(0, False)}}
     assert sides == {False, True}
 
 
@@ -328,18 +328,18 @@ def test_copies_reach_out_of_the_image_at_both_sides():
 def test_what_a_copy_hides_from_the_right_camera_leaves_noc_and_stays_in_occ(boxes):
     views, lost, alike = scene(*boxes), 0, 0
     for seed in range(12):
-        found = copy_paste(np.random.default_rng(seed), views)
-        background = (found.left == views.left) & (found.occ == FAR)
-        np.testing.assert_array_equal(views.occ[background], found.occ[background])
-        gone = background & np.isfinite(views.noc) & np.isnan(found.noc)
+        actual = copy_paste(np.random.default_rng(seed), views)
+        background = (actual.left == views.left) & (actual.occ == FAR)
+        np.testing.assert_array_equal(views.occ[background], actual.occ[background])
+        gone = background & np.isfinite(views.noc) & np.isnan(actual.noc)
         lost += gone.sum()
         y, x = np.nonzero(gone)
         # There the right view now shows something else (one dot in 256 is the same by chance) ...
-        alike += (found.right[y, x - FAR] == views.right[y, x - FAR]).sum()
+        alike += (actual.right[y, x - FAR] == views.right[y, x - FAR]).sum()
         # ... and where a pixel has not left, it still shows the same.
-        kept = background & np.isfinite(found.noc)
-        y, x = np.nonzero(kept)
-        np.testing.assert_array_equal(found.right[y, x - FAR], views.right[y, x - FAR])
+        original = background & np.isfinite(actual.noc)
+        y, x = np.nonzero(original)
+        np.testing.assert_array_equal(actual.right[y, x - FAR], views.right[y, x - FAR])
     assert lost > 500 and alike < 0.02 * lost
 
 
@@ -362,8 +362,8 @@ def test_a_copy_hides_nothing_nearer():
 def test_a_copy_stands_before_what_is_farther():
     farther = Box(20, 10, 70, 40, 12)
     views = scene(CAR, farther)
-    found = [copy_paste(np.random.default_rng(seed), views) for seed in range(20)]
-    assert any(((views.occ == farther.d) & (one.occ == CAR.d)).sum() > 200 for one in found)
+    actual = [copy_paste(np.random.default_rng(seed), views) for seed in range(20)]
+    assert any(((views.occ == farther.d) & (one.occ == CAR.d)).sum() > 200 for one in actual)
 
 
 def test_objects_of_several_disparities_move_as_they_are():
@@ -371,9 +371,9 @@ def test_objects_of_several_disparities_move_as_they_are():
     views = scene(Box(30, 110, 48, 32, 20), Box(30, 142, 48, 32, 22))
     kinds = set()
     for seed in range(12):
-        found = copy_paste(np.random.default_rng(seed), views)
-        assert_photo_consistent(found)
-        kinds |= {(v, int((found.occ == v).sum()) > int((views.occ == v).sum())) for v in (20, 22)}
+        actual = copy_paste(np.random.default_rng(seed), views)
+        assert_photo_consistent(actual)
+        kinds |= {(v, int((actual.occ == v).sum()) > int((views.occ == v).sum())) for v in (20, 22)}
     assert {(20, True), (22, True)} <= kinds
 
 
@@ -390,20 +390,20 @@ def ramp(size, along):
 def test_truth_and_image_keep_together_and_disparities_follow_the_width(along):
     views, sizes = ramp((120, 200), along), set()
     for seed in range(12):
-        found = rescaled(np.random.default_rng(seed), views)
-        rows, columns = found.left.shape
+        actual = rescaled(np.random.default_rng(seed), views)
+        rows, columns = actual.left.shape
         sizes.add((rows, columns))
-        assert_views(found, (rows, columns))
+        assert_views(actual, (rows, columns))
         assert 0.6 * 120 - 1 <= rows <= 1.6 * 120 + 1 and 0.6 * 200 - 1 <= columns <= 1.6 * 200 + 1
         factor = columns / 200
-        np.testing.assert_allclose(found.occ - found.noc, factor, rtol=1e-4)
-        was = found.noc / factor
+        np.testing.assert_allclose(actual.occ - actual.noc, factor, rtol=1e-4)
+        was = actual.noc / factor
         assert np.abs(was - np.rint(was)).max() < 1e-3  # taken from one pixel, never mixed
         step = (120 / rows, 200 / columns)[along]
-        assert np.abs(was - found.left).max() <= 0.5 * step + 1  # half a pixel, and rounding
-        at = (np.indices(found.noc.shape)[along] + 0.5) * step - 0.5
+        assert np.abs(was - actual.left).max() <= 0.5 * step + 1  # half a pixel, and rounding
+        at = (np.indices(actual.noc.shape)[along] + 0.5) * step - 0.5
         assert np.abs(was - at).max() <= 0.5 + 0.01 * step
-        np.testing.assert_array_equal(found.left, found.right)
+        np.testing.assert_array_equal(actual.left, actual.right)
     assert len(sizes) == 12
     assert len({round(100 * (r / 120) / (c / 200)) for r, c in sizes}) > 6  # width and height differ too
 
@@ -411,20 +411,20 @@ def test_truth_and_image_keep_together_and_disparities_follow_the_width(along):
 def test_rescaling_keeps_gaps_gaps():
     views = scene(CAR, POLE)
     for seed in range(6):
-        found = rescaled(np.random.default_rng(seed), views)
-        factor = np.float32(found.left.shape[1] / SIZE[1])
-        known = found.occ[np.isfinite(found.occ)]
+        actual = rescaled(np.random.default_rng(seed), views)
+        factor = np.float32(actual.left.shape[1] / SIZE[1])
+        known = actual.occ[np.isfinite(actual.occ)]
         assert {round(float(v)) for v in np.unique(known / factor)} == {FAR, CAR.d, POLE.d}
-        assert abs(np.isfinite(found.noc).mean() - np.isfinite(views.noc).mean()) < 0.03
-        assert not (np.isfinite(found.noc) & np.isnan(found.occ)).any()
+        assert abs(np.isfinite(actual.noc).mean() - np.isfinite(views.noc).mean()) < 0.03
+        assert not (np.isfinite(actual.noc) & np.isnan(actual.occ)).any()
 
 
 def test_nothing_gets_smaller_than_64_pixels():
     views = ramp((30, 40), 1)
     for seed in range(6):
-        found = rescaled(np.random.default_rng(seed), views)
-        assert found.left.shape == (64, 64)
-        assert np.nanmax(found.noc) == pytest.approx(39 * 64 / 40)
+        actual = rescaled(np.random.default_rng(seed), views)
+        assert actual.left.shape == (64, 64)
+        assert np.nanmax(actual.noc) == pytest.approx(39 * 64 / 40)
 
 
 # --- photographed --------------------------------------------------------------------------------------------------
@@ -435,15 +435,15 @@ def test_exposure_leaves_the_truth_and_the_order_of_grey_levels():
     views = Views(image, image.copy(), *np.full((2, 256, 400), 5, np.float32))
     levels = []
     for seed in range(12):
-        found = photographed(np.random.default_rng(seed), views)
-        assert_views(found, (256, 400))
-        np.testing.assert_array_equal(found.noc, views.noc)
-        np.testing.assert_array_equal(found.occ, views.occ)
-        for view in (found.left, found.right):
+        actual = photographed(np.random.default_rng(seed), views)
+        assert_views(actual, (256, 400))
+        np.testing.assert_array_equal(actual.noc, views.noc)
+        np.testing.assert_array_equal(actual.occ, views.occ)
+        for view in (actual.left, actual.right):
             mean = view.mean(axis=1)
             assert (np.diff(cv2.blur(mean, (1, 9)).ravel()) > -0.5).all()  # noise apart, and clipped, never wrapped
             assert mean[-1] > 128 and mean[0] < 40
-        levels.append((found.left.mean(), found.right.mean(), found.left.std(axis=1).max()))
+        levels.append((actual.left.mean(), actual.right.mean(), actual.left.std(axis=1).max()))
     left, right, noise = np.array(levels).T
     assert np.ptp(left) > 20 and (left != right).all() and np.abs(left - right).max() < 20
     assert np.ptp(noise) > 0.5 and noise.max() < 15
@@ -452,9 +452,9 @@ def test_exposure_leaves_the_truth_and_the_order_of_grey_levels():
 def test_noise_differs_between_the_views():
     flat = np.full((80, 80), 120, np.uint8)
     views = Views(flat, flat, *np.full((2, 80, 80), 5, np.float32))
-    found = [photographed(np.random.default_rng(seed), views) for seed in range(8)]
+    actual = [photographed(np.random.default_rng(seed), views) for seed in range(8)]
     correlations = []
-    for one in found:
+    for one in actual:
         a, b = (view - view.mean() for view in (one.left, one.right))
         if a.std() > 0.5:
             correlations.append((a * b).mean() / (a.std() * b.std()))

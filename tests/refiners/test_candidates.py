@@ -6,14 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from refining import LEARNED, NAMES, coarse_of, half_of, image_of, needs_backend, random_content
+from refining import LEARNED, NAMES, coarse_of, half_of, image_of, random_content
 
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.networks.pyramid import OFFSETS
 from stereokit_refiners.weights import NETWORKS
-
-pytestmark = needs_backend
 
 SIZES = [(16, 32), (33, 47), (1, 1), (1, 9), (9, 1), (18, 31)]
 CHOICES = [(0, 0, 0, 0), (1, 1, 1, 1), (0, 1, 1, 0), (1, 0, 0, 0)]
@@ -62,23 +60,27 @@ def test_tensors_copy_the_same_candidate(choice, size):
     from stereokit_refiners.runtimes.tensors import TensorRefiner
 
     coarse = coarse_of(size, 1)
-    given = coarse.disparity, coarse.confidence, image_of(size, 1), coarse.candidates
-    found = TensorRefiner(choosing(choice), "cpu")(*given).numpy()
-    np.testing.assert_allclose(found, chosen(coarse.candidates, choice, size), rtol=1e-6)
+    arguments = coarse.disparity, coarse.confidence, image_of(size, 1), coarse.candidates
+    actual = TensorRefiner(choosing(choice), "cpu")(*arguments).numpy()
+    np.testing.assert_allclose(actual, chosen(coarse.candidates, choice, size), rtol=1e-6)
 
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_exported_graphs_copy_the_same_candidate(choice):
     onnxruntime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
     from stereokit_refiners.commands.export import onnx_model
 
     size = (16, 32)
     coarse, left = coarse_of(size, 1), image_of(size, 1).astype(np.float32)
-    given = {"coarse": coarse.disparity, "confidence": coarse.confidence, "left": left, "candidates": coarse.candidates}
+    arguments = {
+        "coarse": coarse.disparity,
+        "confidence": coarse.confidence,
+        "left": left,
+        "candidates": coarse.candidates,
+    }
     session = onnxruntime.InferenceSession(onnx_model(choosing(choice)), providers=["CPUExecutionProvider"])
-    (found,) = session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in given.items()})
-    np.testing.assert_allclose(found[0, 0], chosen(coarse.candidates, choice, size), rtol=1e-6)
+    (actual,) = session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in arguments.items()})
+    np.testing.assert_allclose(actual[0, 0], chosen(coarse.candidates, choice, size), rtol=1e-6)
 
 
 def test_candidates_do_not_fill_gaps_of_the_map():
@@ -100,8 +102,8 @@ def test_candidates_are_read_in_any_layout(size):
     wide[..., 1] = coarse.candidates
     for other in (np.asfortranarray(coarse.candidates), wide[..., 1], coarse.candidates[::-1].copy()[::-1]):
         assert not other.flags.c_contiguous
-        found = refiner(dataclasses.replace(coarse, candidates=other), left).disparity
-        np.testing.assert_array_equal(found, expected)
+        actual = refiner(dataclasses.replace(coarse, candidates=other), left).disparity
+        np.testing.assert_array_equal(actual, expected)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -17,7 +17,6 @@ from refining import (
     flat_ranges,
     half_of,
     image_of,
-    needs_backend,
     one_line,
     random_content,
     sure,
@@ -30,8 +29,6 @@ from stereokit import Disparity
 from stereokit.errors import OptionError, StereokitError
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import NETWORKS
-
-pytestmark = needs_backend
 
 SIZES = [(32, 48), (33, 47), (1, 1), (1, 9), (9, 1), (2, 3), (18, 30), (31, 16)]
 
@@ -55,12 +52,12 @@ def exact(request):
 @pytest.mark.parametrize("size", SIZES)
 def test_shapes_types_and_untouched_inputs(refiner, size):
     coarse, left = coarse_of(size, gaps=0.1), image_of(size)
-    kept = [np.copy(a) for a in (*vars(coarse).values(), left) if a is not None]
+    original = [np.copy(a) for a in (*vars(coarse).values(), left) if a is not None]
     fine = refiner(coarse, left)
     for array, dtype in ((fine.disparity, np.float32), (fine.valid, np.bool_), (fine.confidence, np.float32)):
         assert array.shape == size
         assert array.dtype == dtype
-    for before, after in zip(kept, (a for a in (*vars(coarse).values(), left) if a is not None), strict=True):
+    for before, after in zip(original, (a for a in (*vars(coarse).values(), left) if a is not None), strict=True):
         np.testing.assert_array_equal(before, after)
     for mine in (fine.disparity, fine.valid, fine.confidence):
         for theirs in (coarse.disparity, coarse.valid, coarse.confidence, coarse.candidates, left):
@@ -106,9 +103,9 @@ def test_disparities_below_zero_are_refined_like_those_above(exact, down):
     above = dataclasses.replace(coarse, disparity=coarse.disparity.copy(), candidates=np.abs(coarse.candidates))
     above.disparity[:2] = above.candidates[0, 0, 0] = 0  # so that both have the same lowest level
     below = dataclasses.replace(above, disparity=above.disparity - np.float32(down), candidates=above.candidates - down)
-    found, expected = exact(below, left), exact(above, left)
-    np.testing.assert_allclose(found.disparity, expected.disparity - 2 * down, rtol=0, atol=2e-3)
-    np.testing.assert_array_equal(found.valid, expected.valid)
+    actual, expected = exact(below, left), exact(above, left)
+    np.testing.assert_allclose(actual.disparity, expected.disparity - 2 * down, rtol=0, atol=2e-3)
+    np.testing.assert_array_equal(actual.valid, expected.valid)
 
 
 @pytest.mark.parametrize("size", [(33, 47), (1, 9)])
@@ -124,19 +121,19 @@ def test_the_same_call_gives_the_same_bits_with_any_threads(refiner, size):
 
 def test_results_of_earlier_calls_stay(refiner):
     first = refiner(coarse_of((16, 16)), image_of((16, 16))).disparity
-    kept = first.copy()
+    original = first.copy()
     refiner(coarse_of((16, 16), 1), image_of((16, 16), 1))
-    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(first, original)
 
 
 def test_four_threads_at_once(refiner):
     sizes = [(20, 30), (33, 17), (20, 30), (9, 40)]
     expected = [refiner(coarse_of(s, k), image_of(s, k)).disparity for k, s in enumerate(sizes)]
-    found = [None] * 4
+    actual = [None] * 4
 
     def work(k):
         for _ in range(3):
-            found[k] = refiner(coarse_of(sizes[k], k), image_of(sizes[k], k)).disparity
+            actual[k] = refiner(coarse_of(sizes[k], k), image_of(sizes[k], k)).disparity
 
     workers = [threading.Thread(target=work, args=(k,)) for k in range(4)]
     for worker in workers:
@@ -144,7 +141,7 @@ def test_four_threads_at_once(refiner):
     for worker in workers:
         worker.join()
     for k in range(4):
-        np.testing.assert_array_equal(found[k], expected[k])
+        np.testing.assert_array_equal(actual[k], expected[k])
 
 
 @pytest.mark.parametrize("size", [(33, 47), (31, 18), (9, 9), (1, 9)])
@@ -254,8 +251,8 @@ def test_fingerprints_say_what_the_result_depends_on(tmp_path):
         random_content("cnn", output_mode="direct"),
         random_content("cnn", ranges=flat_ranges("cnn", 2)),
     ]
-    found = {LearnedRefiner.of(content, precision="auto").fingerprint for content in others} | {first.fingerprint}
-    assert len(found) == 4
+    actual = {LearnedRefiner.of(content, precision="auto").fingerprint for content in others} | {first.fingerprint}
+    assert len(actual) == 4
     assert first.fingerprint.endswith(f"-{first.backend}-{first.precision}")
 
 
@@ -273,10 +270,11 @@ def test_backends_are_checked(tmp_path):
         LearnedRefiner(path, precision="fp16")
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch", "opencv"])
 @pytest.mark.parametrize("precision", ["bf16", "int8"])
 def test_low_precision_needs_openvino(backend, precision):
-    pytest.importorskip(backend)
+    if backend not in LEARNED:
+        pytest.skip(f"needs {backend}")
     with pytest.raises(OptionError, match=rf"^precision must be fp32 with backend '{backend}', got '{precision}'$"):
         LearnedRefiner.of(random_content("cnn"), backend=backend, precision=precision)
     assert LearnedRefiner.of(random_content("cnn"), backend=backend).precision == "fp32"
@@ -311,20 +309,16 @@ def test_a_runtime_that_is_not_there_is_named(monkeypatch):
     real = importlib.util.find_spec
     gone = {"openvino", "onnxruntime", "torch"}
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n in gone else real(n, *a))
-    for backend, extra in {"openvino": "fast", "onnxruntime": "onnx", "torch": "train"}.items():
+    for backend, extra in {"openvino": "refiners", "onnxruntime": "onnx", "torch": "train"}.items():
         with pytest.raises(StereokitError, match=rf"^backend '{backend}' is not installed: .*stereokit\[{extra}\]'$"):
             LearnedRefiner.of(random_content("cnn"), backend=backend)
-    rule = r"need OpenVINO, ONNX Runtime or torch: pip install 'stereokit\[refiners\]', or 'stereokit\[onnx\]' where "
-    with pytest.raises(StereokitError, match=rule):
+    assert LearnedRefiner.of(random_content("cnn")).backend == "opencv"
+    monkeypatch.delattr("cv2.dnn")
+    with pytest.raises(
+        StereokitError, match=r"^backend 'opencv' is not installed: pip install opencv-python-headless$"
+    ):
+        LearnedRefiner.of(random_content("cnn"), backend="opencv")
+    with pytest.raises(
+        StereokitError, match=r"^learned refiners need OpenCV's dnn, which this build lacks, or another "
+    ):
         LearnedRefiner.of(random_content("cnn"))
-
-
-def test_onnxruntime_without_onnx_is_not_chosen(monkeypatch):
-    import importlib.util
-
-    real = importlib.util.find_spec
-    hidden = {"openvino", "onnx"}
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n in hidden else real(n, *a))
-    if real("torch") is None:
-        pytest.skip("needs torch beside ONNX Runtime")
-    assert LearnedRefiner.of(random_content("cnn")).backend == "torch"

@@ -87,10 +87,10 @@ def _plain(step, disparity, candidates, left, right):
                        for m in maps])  # fmt: skip
     bits = [_bits(_grown(image, height, width)) for image in (left, right)]
 
-    def distance(y, x, at):
-        if not 0 <= at < columns:
+    def distance(y, x, right_x):
+        if not 0 <= right_x < columns:
             return 8
-        return sum(a != b for a, b in zip(bits[0][y][x], bits[1][y][at], strict=True))
+        return sum(a != b for a, b in zip(bits[0][y][x], bits[1][y][right_x], strict=True))
 
     def cost(y, x, value):
         eighths = math.floor(value * 8 + 0.5)
@@ -112,29 +112,29 @@ def _plain(step, disparity, candidates, left, right):
 @pytest.mark.parametrize("step", [1, 2, 4])
 def test_values_and_costs_are_those_of_plain_loops(step):
     disparity, candidates, _, left, right = _case(step)
-    found = hypotheses(disparity, candidates, left, right, step)
+    fields = hypotheses(disparity, candidates, left, right, step)
     coarse, half, others, cost, gains = _plain(step, disparity, candidates, left, right)
-    np.testing.assert_array_equal(found.coarse + found.base, coarse)
-    np.testing.assert_array_equal(found.half + found.base, half)
-    np.testing.assert_array_equal(found.others + found.base, others)
-    np.testing.assert_array_equal(found.cost, cost)
-    np.testing.assert_array_equal(found.gains, gains)
+    np.testing.assert_array_equal(fields.coarse + fields.base, coarse)
+    np.testing.assert_array_equal(fields.half + fields.base, half)
+    np.testing.assert_array_equal(fields.others + fields.base, others)
+    np.testing.assert_array_equal(fields.cost, cost)
+    np.testing.assert_array_equal(fields.gains, gains)
 
 
-def _plain_input(found, confidence, left, columns):
-    height, width = found.coarse.shape
-    step = found.step
+def _plain_input(fields, confidence, left, columns):
+    height, width = fields.coarse.shape
+    step = fields.step
     image = _grown(left, height, width).astype(np.float64)
     sure = _grown(confidence, height // step, width // step)
     block = lambda plane, y, x, n: plane[n * y : n * y + n, n * x : n * x + n]  # noqa: E731
     quarter = height // 4, width // 4
     grid = [(y, x) for y in range(quarter[0]) for x in range(quarter[1])]
-    half = np.array([[block(found.coarse, y, x, 2).mean() for x in range(width // 2)] for y in range(height // 2)])
+    half = np.array([[block(fields.coarse, y, x, 2).mean() for x in range(width // 2)] for y in range(height // 2)])
     means = {name: np.zeros(quarter) for name in ("grey", "square", "coarse")}
     for y, x in grid:
         means["grey"][y, x] = block(image, y, x, 4).mean()
         means["square"][y, x] = (block(image, y, x, 4) ** 2).mean()
-        means["coarse"][y, x] = block(found.coarse, y, x, 4).mean()
+        means["coarse"][y, x] = block(fields.coarse, y, x, 4).mean()
 
     def around(plane, y, x, reach):
         cells = range(-reach, reach + 1)
@@ -147,16 +147,16 @@ def _plain_input(found, confidence, left, columns):
     for y in range(half.shape[0]):
         nearest = {}
         for x in range(half.shape[1]):
-            at = math.floor((2 * x - found.base - half[y, x]) / 2)
-            outside[y, x] = not 0 <= at < reach
-            for place in (at, at + 1):
+            target = math.floor((2 * x - fields.base - half[y, x]) / 2)
+            outside[y, x] = not 0 <= target < reach
+            for place in (target, target + 1):
                 if 0 <= place < reach and x < reach:
                     nearest[place] = max(nearest.get(place, -1e9), half[y, x])
         for k in range(5):
             for x in range(half.shape[1]):
-                value = half[y, x] if k == 0 else found.others[k - 1, y, x]
-                at = math.floor((2 * x - found.base - value) / 2 + 0.5)
-                surface[k, y, x] = nearest[at] - value if at in nearest else 0
+                value = half[y, x] if k == 0 else fields.others[k - 1, y, x]
+                target = math.floor((2 * x - fields.base - value) / 2 + 0.5)
+                surface[k, y, x] = nearest[target] - value if target in nearest else 0
     out = np.zeros((sum(CHANNELS.values()), *quarter))
     for y, x in grid:
         grey = around(means["grey"], y, x, 4)
@@ -167,10 +167,10 @@ def _plain_input(found, confidence, left, columns):
         column += by_two(lambda v, u: 4 * sure[2 * v // step, 2 * u // step] - 2)
         column += by_two(lambda v, u: squash(half[v, u] - around(means["coarse"], y, x, 8), 8))  # noqa: B023
         for k in range(4):
-            column += by_two(lambda v, u: squash(found.others[k, v, u] - half[v, u], 2))  # noqa: B023
-        column += by_two(lambda v, u: found.cost[v, u] / 32 - 1)
+            column += by_two(lambda v, u: squash(fields.others[k, v, u] - half[v, u], 2))  # noqa: B023
+        column += by_two(lambda v, u: fields.cost[v, u] / 32 - 1)
         for k in range(6):
-            column += by_two(lambda v, u: found.gains[k, v, u] / 40)  # noqa: B023
+            column += by_two(lambda v, u: fields.gains[k, v, u] / 40)  # noqa: B023
         for k in range(5):
             column += by_two(lambda v, u: squash(surface[k, v, u], 2))  # noqa: B023
         column += [block(outside, y, x, 2).mean(), {1: -1, 2: 0, 4: 1}[step]]
@@ -181,53 +181,53 @@ def _plain_input(found, confidence, left, columns):
 @pytest.mark.parametrize("step", [1, 2, 4])
 def test_the_networks_input_is_that_of_plain_loops(step):
     disparity, candidates, confidence, left, right = _case(step, seed=1)
-    found = hypotheses(disparity, candidates, left, right, step)
-    given = network_input(found, confidence, left, COLUMNS)
-    assert given.dtype == np.int8
-    wanted = _plain_input(found, confidence, left, COLUMNS)
-    assert np.abs(given - wanted).max() <= 1  # the cost is rounded down
-    assert np.abs(np.delete(given - wanted, slice(40, 44), 0)).max() < 0.51
+    fields = hypotheses(disparity, candidates, left, right, step)
+    options = network_input(fields, confidence, left, COLUMNS)
+    assert options.dtype == np.int8
+    wanted = _plain_input(fields, confidence, left, COLUMNS)
+    assert np.abs(options - wanted).max() <= 1  # the cost is rounded down
+    assert np.abs(np.delete(options - wanted, slice(40, 44), 0)).max() < 0.51
 
 
-def _head(rng, found, scale=2.0):
-    height, width = found.coarse.shape
+def _head(rng, fields, scale=2.0):
+    height, width = fields.coarse.shape
     return (rng.normal(size=(height // 4, width // 4, LOGITS + GAINS + 4)) * scale).astype(np.float32)
 
 
-def _plain_mixture(head, found, y, x):
+def _plain_mixture(head, fields, y, x):
     cell, part = head[y // 4, x // 4].astype(np.float64), 2 * (y % 4 // 2) + x % 4 // 2
     v, u = y // 2, x // 2
-    b = float(found.coarse[y, x])
-    values = [b, b - found.apart, b + found.apart, *(float(found.others[k, v, u]) for k in range(4))]
+    b = float(fields.coarse[y, x])
+    values = [b, b - fields.apart, b + fields.apart, *(float(fields.others[k, v, u]) for k in range(4))]
     weights = [1.0]
     for k in range(6):
         logit = cell[4 * k + part]
         for n, reach in enumerate((1, 3)):
             cells = range(-reach, reach + 1)
-            mean = np.mean([float(_at(found.gains[k], v + i, u + j)) for i in cells for j in cells])
+            mean = np.mean([float(_at(fields.gains[k], v + i, u + j)) for i in cells for j in cells])
             logit += cell[LOGITS + 2 * n + (k >= 2)] * mean / 16
         weights.append(math.exp(min(max(logit, -40), 40)))
     sure = cell[LOGITS + GAINS + part]
-    return found.base + np.dot(weights, values) / sum(weights), 1 / (1 + math.exp(-sure))
+    return fields.base + np.dot(weights, values) / sum(weights), 1 / (1 + math.exp(-sure))
 
 
 def test_the_mixture_is_that_of_plain_loops():
     disparity, candidates, _, left, right = _case(2, seed=2)
-    found = hypotheses(disparity, candidates, left, right, 2)
-    head = _head(np.random.default_rng(3), found, 0.7)
-    full, sure = mixture(head, found, ROWS, COLUMNS)
+    fields = hypotheses(disparity, candidates, left, right, 2)
+    head = _head(np.random.default_rng(3), fields, 0.7)
+    full, sure = mixture(head, fields, ROWS, COLUMNS)
     for y in range(ROWS):
         for x in range(COLUMNS):
-            assert (full[y, x], sure[y, x]) == pytest.approx(_plain_mixture(head, found, y, x), abs=2e-4)
+            assert (full[y, x], sure[y, x]) == pytest.approx(_plain_mixture(head, fields, y, x), abs=2e-4)
 
 
 def test_a_head_that_refuses_all_others_leaves_the_upscaled_map():
     disparity, candidates, _, left, right = _case(2, seed=4)
-    found = hypotheses(disparity, candidates, left, right, 2)
-    head = np.zeros_like(_head(np.random.default_rng(0), found))
+    fields = hypotheses(disparity, candidates, left, right, 2)
+    head = np.zeros_like(_head(np.random.default_rng(0), fields))
     head[..., :LOGITS] = -40
-    full, _ = mixture(head, found, ROWS, COLUMNS)
-    np.testing.assert_allclose(full, (found.coarse + found.base)[:ROWS, :COLUMNS], atol=1e-6)
+    full, _ = mixture(head, fields, ROWS, COLUMNS)
+    np.testing.assert_allclose(full, (fields.coarse + fields.base)[:ROWS, :COLUMNS], atol=1e-6)
 
 
 @pytest.mark.parametrize("step", [1, 2, 4])
@@ -255,18 +255,18 @@ def test_a_constant_added_to_all_disparities_changes_no_bit_of_the_input(by):
     disparity = rng.integers(0, 20 * 256, size).astype(np.float32) / 256  # what is kept of a map
     candidates = rng.integers(0, 20 * 256, (2, *size)).astype(np.float32) / 256
     confidence = rng.random(size).astype(np.float32)
-    found = [
+    fields = [
         hypotheses(disparity + np.float32(s / 2), candidates + np.float32(s / 2), left, right, 2)
         for s, right in zip((0, by), slid, strict=True)
     ]
-    assert found[1].base - found[0].base == by
-    np.testing.assert_array_equal(found[0].coarse, found[1].coarse)
-    inputs = [network_input(f, confidence, left, columns) for f in found]
+    assert fields[1].base - fields[0].base == by
+    np.testing.assert_array_equal(fields[0].coarse, fields[1].coarse)
+    inputs = [network_input(f, confidence, left, columns) for f in fields]
     inner = slice((max(by, 0) + 64) // 4, (columns - 64 + min(by, 0)) // 4)
     np.testing.assert_array_equal(inputs[0][:, :, inner], inputs[1][:, :, inner])
-    head = _head(rng, found[0])
+    head = _head(rng, fields[0])
     columns_in = slice(4 * inner.start + 8, 4 * inner.stop - 8)
-    maps = [mixture(head, f, rows, columns)[0][:, columns_in] for f in found]
+    maps = [mixture(head, f, rows, columns)[0][:, columns_in] for f in fields]
     np.testing.assert_allclose(maps[0] + np.float32(by), maps[1], atol=2e-4)
 
 
@@ -284,7 +284,7 @@ def _refiner(backend="auto"):
     return EvidenceRefiner.of(_weights(), backend=backend, precision="fp32")
 
 
-@pytest.mark.parametrize("backend", ["openvino", "onnxruntime"])
+@pytest.mark.parametrize("backend", ["openvino", "onnxruntime", "opencv"])
 def test_runtimes_agree_with_torch(backend):
     disparity, candidates, confidence, left, right = _case(2, seed=8, rows=61, columns=75)
     coarse = stereokit.Disparity(disparity, np.ones(disparity.shape, bool), confidence, candidates=candidates)
@@ -303,31 +303,31 @@ def test_maps_stay_inside_the_range_at_any_scale(scale, low, high):
         "S2", min_disparity=low, max_disparity=high, scale=scale, refiner=refiner, device="cpu", confidence=True
     )
     for left, right in ((blank, blank), noise):
-        found = matcher(left, right)
-        assert found.disparity.shape == (35, 50)
-        assert np.isfinite(found.disparity).all()
-        assert found.disparity.min() >= low
-        assert found.disparity.max() <= high - 1
-        assert found.confidence is not None
-        assert 0 <= found.confidence.min() <= found.confidence.max() <= 1
+        fields = matcher(left, right)
+        assert fields.disparity.shape == (35, 50)
+        assert np.isfinite(fields.disparity).all()
+        assert fields.disparity.min() >= low
+        assert fields.disparity.max() <= high - 1
+        assert fields.confidence is not None
+        assert 0 <= fields.confidence.min() <= fields.confidence.max() <= 1
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.25])
 @pytest.mark.parametrize("low", [-7, 5])
 def test_linear_maps_of_odd_ranges_stay_inside_too(scale, low):
     noise = np.random.default_rng(10).integers(0, 256, (2, 35, 50), dtype=np.uint8)
-    found = stereokit.match(*noise, "S2", min_disparity=low, max_disparity=low + 14, scale=scale, device="cpu")
-    assert low <= found.min()
-    assert found.max() <= low + 13
+    fields = stereokit.match(*noise, "S2", min_disparity=low, max_disparity=low + 14, scale=scale, device="cpu")
+    assert low <= fields.min()
+    assert fields.max() <= low + 13
 
 
 def test_gaps_stay_gaps_and_neighbours_are_as_if_filled():
     noise = np.random.default_rng(11).integers(0, 256, (2, 40, 60), dtype=np.uint8)
-    found = stereokit.Matcher("S2", max_disparity=32, scale=0.5, refiner=_refiner(), fill=None, device="cpu")(*noise)
-    gaps = np.isnan(found.disparity)
+    fields = stereokit.Matcher("S2", max_disparity=32, scale=0.5, refiner=_refiner(), fill=None, device="cpu")(*noise)
+    gaps = np.isnan(fields.disparity)
     assert gaps.any()
     assert not gaps.all()
-    assert not found.valid[gaps].any()
+    assert not fields.valid[gaps].any()
 
 
 def test_grey_level_and_gain_change_little():
@@ -335,9 +335,9 @@ def test_grey_level_and_gain_change_little():
     disparity, candidates, confidence, left, right = _case(2, seed=12, rows=64, columns=96)
     dark = [(image // 2 + 10).astype(np.uint8) for image in (left, right)]
     doubled = [((image - 10) * 2).astype(np.uint8) for image in dark]
-    found = [hypotheses(disparity, candidates, *pair, 2) for pair in (dark, doubled)]
-    np.testing.assert_array_equal(found[0].gains, found[1].gains)
-    inputs = [network_input(f, confidence, pair[0], 96) for f, pair in zip(found, (dark, doubled), strict=True)]
+    fields = [hypotheses(disparity, candidates, *pair, 2) for pair in (dark, doubled)]
+    np.testing.assert_array_equal(fields[0].gains, fields[1].gains)
+    inputs = [network_input(f, confidence, pair[0], 96) for f, pair in zip(fields, (dark, doubled), strict=True)]
     grey = slice(0, CHANNELS["grey"])
     assert np.abs(inputs[0][grey].astype(int) - inputs[1][grey]).max() < 0.15 * STEPS
     np.testing.assert_array_equal(inputs[0][16:], inputs[1][16:])
@@ -380,9 +380,9 @@ def _scene():
 @pytest.mark.parametrize("scale", [1, 0.5, 0.25])
 def test_shipped_weights_sharpen_edges_and_keep_what_is_right(scale):
     left, right, truth = _scene()
-    given = {"max_disparity": 32, "scale": scale, "device": "cpu"}
-    plain, general = (stereokit.match(left, right, "S2", refiner=r, **given) for r in ("linear", "general"))
-    wrong = [float((np.abs(found - truth)[:, 20:] > 1).mean()) for found in (plain, general)]
+    options = {"max_disparity": 32, "scale": scale, "device": "cpu"}
+    plain, general = (stereokit.match(left, right, "S2", refiner=r, **options) for r in ("linear", "general"))
+    wrong = [float((np.abs(fields - truth)[:, 20:] > 1).mean()) for fields in (plain, general)]
     assert wrong[1] <= wrong[0]
     if scale < 1:
         assert wrong[1] < 0.7 * wrong[0]
@@ -416,9 +416,9 @@ def test_shipped_weights_follow_an_offset_of_all_disparities():
     by = 200
     wide = [np.pad(image, ((0, 0), (by, 0)), mode="edge") for image in (left, right)]
     wide[1] = np.roll(wide[1], -by, axis=1)
-    given = {"scale": 0.5, "refiner": "general", "device": "cpu"}
-    near = stereokit.match(*wide, "S2", min_disparity=by, max_disparity=by + 32, **given)[:, by:] - by
-    plain = stereokit.match(left, right, "S2", max_disparity=32, **given)
-    medians = [float(np.median((found - truth)[:, 40:])) for found in (near, plain)]
+    options = {"scale": 0.5, "refiner": "general", "device": "cpu"}
+    near = stereokit.match(*wide, "S2", min_disparity=by, max_disparity=by + 32, **options)[:, by:] - by
+    plain = stereokit.match(left, right, "S2", max_disparity=32, **options)
+    medians = [float(np.median((fields - truth)[:, 40:])) for fields in (near, plain)]
     assert medians[0] == pytest.approx(medians[1], abs=0.02)
     assert np.abs(near - plain)[:, 64:].mean() < 0.05

@@ -47,9 +47,9 @@ def test_what_is_packed_comes_back():
         for name, (channels, dtype) in training._FIELDS.items()
     }  # fmt: skip
     fields["input"] = rng.integers(-127, 128, (sum(CHANNELS.values()), 3, 5)).astype(np.int8)
-    found = training.unpacked(training.packed(fields))
+    unpacked = training.unpacked(training.packed(fields))
     for name, array in fields.items():
-        np.testing.assert_array_equal(found[name], array.transpose(1, 2, 0))
+        np.testing.assert_array_equal(unpacked[name], array.transpose(1, 2, 0))
 
 
 @pytest.mark.parametrize("step", [1, 2, 4])
@@ -58,24 +58,24 @@ def test_the_mixture_of_stored_samples_is_that_of_the_kernels(step):
     left, right, *_ = _pair()
     size = -(-left.shape[0] // step), -(-left.shape[1] // step)
     disparity, one, two = (rng.random((3, *size)) * 20 / step).astype(np.float32)
-    found = hypotheses(disparity, np.stack([one, two]), left, right, step)
-    head = rng.normal(size=(found.coarse.shape[0] // 4, found.coarse.shape[1] // 4, LOGITS + GAINS + 4))
+    fields = hypotheses(disparity, np.stack([one, two]), left, right, step)
+    head = rng.normal(size=(fields.coarse.shape[0] // 4, fields.coarse.shape[1] // 4, LOGITS + GAINS + 4))
     head = head.astype(np.float32)
-    wanted = compiled_mixture(head, found, *left.shape)[0]
+    expected = compiled_mixture(head, fields, *left.shape)[0]
 
     def folded(plane, side):
         return training._folded(plane, side)
 
-    near = np.concatenate([folded(values - found.half, 2) for values in found.others])
-    within = folded(found.coarse - found.half.repeat(2, 0).repeat(2, 1), 4)
-    given = network_input(found, rng.random(size).astype(np.float32), left, left.shape[1]).transpose(1, 2, 0)
-    means = training.gains_around(given[None])[0].transpose(2, 0, 1)
+    near = np.concatenate([folded(values - fields.half, 2) for values in fields.others])
+    within = folded(fields.coarse - fields.half.repeat(2, 0).repeat(2, 1), 4)
+    inputs = network_input(fields, rng.random(size).astype(np.float32), left, left.shape[1]).transpose(1, 2, 0)
+    means = training.gains_around(inputs[None])[0].transpose(2, 0, 1)
     tensors = [
         torch.from_numpy(part.astype(np.float32))[None] for part in (head.transpose(2, 0, 1), means, near, within)
     ]
-    full = training.mixture(*tensors, torch.tensor([float(found.apart)]))[0].numpy()
-    full = (full + found.half.repeat(2, 0).repeat(2, 1) + found.base)[: left.shape[0], : left.shape[1]]
-    np.testing.assert_allclose(full, wanted, atol=1e-3)
+    full = training.mixture(*tensors, torch.tensor([float(fields.apart)]))[0].numpy()
+    full = (full + fields.half.repeat(2, 0).repeat(2, 1) + fields.base)[: left.shape[0], : left.shape[1]]
+    np.testing.assert_allclose(full, expected, atol=1e-3)
 
 
 def test_samples_say_what_is_missing_and_who_sees_it():

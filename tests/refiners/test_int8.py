@@ -69,10 +69,10 @@ def test_weights_that_alternate_are_summed_to_the_step():
     steps = rng.integers(-WEIGHT_STEPS, WEIGHT_STEPS + 1, (16, channels, 3, 3))
     steps[:, 0, 0, 0] = WEIGHT_STEPS  # the largest, which decides what a step is
     values = rng.integers(-12, 128, channels)  # of 127; a leaky ReLU makes tenths of the negative ones
-    given = np.where(values < 0, 10 * values, values) / 127
+    arguments = np.where(values < 0, 10 * values, values) / 127
     arrays = {
         "a.weight": np.zeros((channels, 1, 1, 1), np.float32),
-        "a.bias": given.astype(np.float32),
+        "a.bias": arguments.astype(np.float32),
         "b.weight": (steps / WEIGHT_STEPS).astype(np.float32),
         "b.bias": np.zeros(16, np.float32),
     }
@@ -107,15 +107,15 @@ def heads(name, ranges):
         if values.ndim == 4:
             step = np.abs(values).max(axis=(1, 2, 3), keepdims=True) / WEIGHT_STEPS
             off[key] = waver(torch.from_numpy(values), torch.from_numpy(step)).numpy()
-    given = encoded_of(name, 32, 48)
-    inputs = {key: torch.from_numpy(a)[None] for key, a in given.items()}
+    arguments = encoded_of(name, 32, 48)
+    inputs = {key: torch.from_numpy(a)[None] for key, a in arguments.items()}
     module = runtime.Module(network)
-    found = [compiled(network, plain, 32, 48, 1, "int8", ranges)(given)]
+    actual = [compiled(network, plain, 32, 48, 1, "int8", ranges)(arguments)]
     with torch.inference_mode():
         for arrays, ops in ((plain, runtime._TorchOps), (off, Wavering)):
             module.load(arrays)
-            found.append(network.forward(ops(module), inputs)["map"][0].permute(1, 2, 0).numpy())
-    return found
+            actual.append(network.forward(ops(module), inputs)["map"][0].permute(1, 2, 0).numpy())
+    return actual
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import oracles
 import pytest
@@ -28,10 +30,10 @@ def coarse_of(size, seed=0, gaps=0.0):
 @pytest.mark.parametrize("size", SIZES)
 def test_the_map_doubles_in_size_and_in_value(size):
     coarse = coarse_of(size)
-    kept = coarse.disparity.copy()
+    original = coarse.disparity.copy()
     fine = Linear()(coarse, np.zeros(size, np.uint8))
     np.testing.assert_allclose(fine.disparity, 2 * oracles.double(coarse.disparity, *size), rtol=1e-5)
-    np.testing.assert_array_equal(coarse.disparity, kept)
+    np.testing.assert_array_equal(coarse.disparity, original)
     assert fine.disparity.dtype == np.float32
     assert fine.disparity.shape == fine.valid.shape == fine.confidence.shape == size
 
@@ -73,13 +75,32 @@ def test_bits_are_those_of_loops_whatever_the_threads(size, threads):
 
 
 @pytest.mark.parametrize("size", [*SIZES, (23, 150)])
+def test_bits_at_a_quarter_of_the_size_are_those_of_loops(size):
+    """Down the columns first; each sum of two products is rounded as single precision rounds it."""
+    height, width = size
+    shape = -(-height // 4), -(-width // 4)
+    image = (np.random.default_rng(6).random(shape) * 40).astype(np.float32)
+    image[np.random.default_rng(7).random(shape) < 0.05] = NAN
+    fine = Linear()(Disparity(image, ~np.isnan(image)), np.zeros(size, np.uint8), scale=0.25)
+
+    def mixed(line, x):
+        share = np.float32((7 if x % 4 in (1, 2) else 5) / 8)
+        beside = min(max(x // 4 + (1 if x % 4 > 1 else -1), 0), len(line) - 1)
+        return line[x // 4] * share + line[beside] * (np.float32(1) - share)
+
+    for y, x in itertools.islice(np.ndindex(size), 0, None, 1 if height * width < 200 else 7):
+        column = [mixed(np.float32(4) * image[:, k], y) for k in range(shape[1])]
+        np.testing.assert_array_equal(fine.disparity[y, x], mixed(column, x))
+
+
+@pytest.mark.parametrize("size", [*SIZES, (23, 150)])
 def test_tensors_are_upscaled_to_the_same_bits(size):
     torch = pytest.importorskip("torch")
     from stereokit_refiners.runtimes.tensors import upscaled
 
     image = coarse_of(size, 5, gaps=0.05).disparity
-    found = upscaled(torch.from_numpy(image), 2, *size).numpy()
-    np.testing.assert_array_equal(found, upscaled_by_loops(image, *size))
+    actual = upscaled(torch.from_numpy(image), 2, *size).numpy()
+    np.testing.assert_array_equal(actual, upscaled_by_loops(image, *size))
 
 
 def test_gaps_stay_gaps_and_reach_no_further_than_their_neighbours():

@@ -28,10 +28,10 @@ def test_the_absolute_error():
 @pytest.mark.parametrize("kind", LOSSES)
 def test_every_distance_is_even_and_grows(kind):
     sizes = [0, 0.1, 0.5, 1, 2, 2.9, 3.1, 5, 10, 19, 40, 200]
-    found = [at(kind, size) for size in sizes]
-    assert found == [at(kind, -size) for size in sizes]
-    assert all(later >= earlier for earlier, later in itertools.pairwise(found))
-    assert found[0] >= 0 and found[6] > found[0]
+    actual = [at(kind, size) for size in sizes]
+    assert actual == [at(kind, -size) for size in sizes]
+    assert all(later >= earlier for earlier, later in itertools.pairwise(actual))
+    assert actual[0] >= 0 and actual[6] > actual[0]
 
 
 def test_the_bounded_distance_is_steep_near_zero_and_flat_afar():
@@ -64,8 +64,8 @@ def test_the_divergence_is_zero_at_the_standard_normal_only():
 
 @pytest.mark.parametrize(("mean", "deviation"), [(0.0, 1.0), (1.3, 0.4), (-2.0, 1.0), (0.5, 2.5)])
 def test_the_divergence_is_its_integral(mean, deviation):
-    found = float(divergence(torch.tensor([mean]), torch.tensor([math.log(deviation)])))
-    assert found == pytest.approx(oracles.divergence(mean, deviation), rel=1e-5, abs=1e-6)
+    actual = float(divergence(torch.tensor([mean]), torch.tensor([math.log(deviation)])))
+    assert actual == pytest.approx(oracles.divergence(mean, deviation), rel=1e-5, abs=1e-6)
 
 
 def test_the_divergence_is_a_mean_over_the_latent():

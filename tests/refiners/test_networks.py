@@ -35,8 +35,8 @@ TOLERANCE = 2e-5
 """Of the largest value of a result: float32 arithmetic against float64, or in another order."""
 
 
-def close(found, expected, tolerance=TOLERANCE):
-    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * max(1.0, np.abs(expected).max()))
+def close(actual, expected, tolerance=TOLERANCE):
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance * max(1.0, np.abs(expected).max()))
 
 
 def test_parameters_are_those_that_a_count_of_the_table_gives():
@@ -55,9 +55,9 @@ def test_every_row_of_table_1(row):
     layers = {layer.name: layer for layer in StereoVae().layers}
     _, _, outputs = cost(StereoVae(), HEIGHT // 2, WIDTH // 2)
     parts = ["MU", "SIGMA"] if name == "mu & sigma" else [name]
-    found = [outputs[part] for part in parts]
-    assert sum(shape[0] for shape in found) == kernels
-    assert {shape[1:] for shape in found} == {(HEIGHT // after, WIDTH // after)}
+    actual = [outputs[part] for part in parts]
+    assert sum(shape[0] for shape in actual) == kernels
+    assert {shape[1:] for shape in actual} == {(HEIGHT // after, WIDTH // after)}
     for part in parts:
         layer = layers[part]
         assert layer.kernel == kernel
@@ -93,13 +93,13 @@ def test_the_pyramid_costs_at_most_what_stereovae_does():
 @pytest.mark.parametrize("name", NAMES)
 def test_names_and_shapes_agree(name):
     network = NETWORKS[name]
-    found = shapes(network)
+    actual = shapes(network)
     assert network.name == name
-    assert len(found) == 2 * len(network.layers)
+    assert len(actual) == 2 * len(network.layers)
     assert set(cost(network, 16, 24)[2]) == {layer.name for layer in network.layers}
     for layer in network.layers:
-        assert found[f"{layer.name}.weight"] == layer.weight_shape
-        assert found[f"{layer.name}.bias"] == (layer.outputs,)
+        assert actual[f"{layer.name}.weight"] == layer.weight_shape
+        assert actual[f"{layer.name}.bias"] == (layer.outputs,)
     up = Layer("up", 3, 7, up=True)
     assert up.weight_shape == (3, 7, 5, 5)
 
@@ -255,10 +255,10 @@ def test_the_latent_has_the_mean_and_the_deviation_that_it_is_drawn_with():
 @pytest.mark.parametrize("name", NAMES)
 def test_weights_go_in_and_come_out_as_they_were(name):
     arrays = random_arrays(name, 4)
-    found = module_of(name, arrays).arrays()
-    assert set(found) == set(shapes(NETWORKS[name]))
+    actual = module_of(name, arrays).arrays()
+    assert set(actual) == set(shapes(NETWORKS[name]))
     for key, array in arrays.items():
-        np.testing.assert_array_equal(found[key], array)
+        np.testing.assert_array_equal(actual[key], array)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -7,15 +7,13 @@ import pickle
 import cv2
 import numpy as np
 import pytest
-from refining import LEARNED, NAMES, needs_backend, one_line, random_content, tuned_to_kitti, weight_file
+from refining import LEARNED, NAMES, one_line, random_content, tuned_to_kitti, weight_file
 from typer.testing import CliRunner
 
 import stereokit
 from stereokit.cli.app import app
 from stereokit.errors import OptionError, StereokitError
 from stereokit_refiners.learned import LearnedRefiner
-
-pytestmark = needs_backend
 
 METHOD = {"method": "census+sgm", "max_disparity": 24, "scale": 0.5}
 
@@ -32,8 +30,8 @@ def path(tmp_path):
     return weight_file(tmp_path, "stereovae")
 
 
-def matcher(**given):
-    return stereokit.Matcher(**{**METHOD, **given})
+def matcher(**arguments):
+    return stereokit.Matcher(**{**METHOD, **arguments})
 
 
 class Keeping:
@@ -71,9 +69,9 @@ def test_the_refiner_sees_the_half_size_map_and_the_full_size_image(pair, path):
     np.testing.assert_array_equal(keeping.left, pair[0])
     assert keeping.threads == 2
     expected = LearnedRefiner(path)(keeping.coarse, pair[0])
-    found = matcher(refiner=path, confidence=True)(*pair)
-    np.testing.assert_array_equal(found.disparity, expected.disparity)
-    np.testing.assert_array_equal(found.confidence, expected.confidence)
+    actual = matcher(refiner=path, confidence=True)(*pair)
+    np.testing.assert_array_equal(actual.disparity, expected.disparity)
+    np.testing.assert_array_equal(actual.confidence, expected.confidence)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -82,9 +80,9 @@ def test_a_matcher_gives_the_confidence_and_keeps_it_back_unless_asked(pair, tmp
     matcher(refiner=keeping, confidence=True)(*pair)
     expected = LearnedRefiner(path)(keeping.coarse, pair[0])
     plain, asked = (matcher(refiner=path, confidence=confidence)(*pair) for confidence in (False, True))
-    for found in (plain, asked):
-        np.testing.assert_array_equal(found.disparity, expected.disparity)
-        np.testing.assert_array_equal(found.valid, expected.valid)
+    for actual in (plain, asked):
+        np.testing.assert_array_equal(actual.disparity, expected.disparity)
+        np.testing.assert_array_equal(actual.valid, expected.valid)
     assert plain.confidence is None
     np.testing.assert_array_equal(asked.confidence, expected.confidence)
     assert [r.confidence for r in matcher(refiner=path, threads=2).map([pair] * 3)] == [None] * 3
@@ -100,11 +98,11 @@ def test_refiners_by_name_with_a_collection_of_weights(pair, name):
 
 @pytest.mark.parametrize("backend", LEARNED)
 def test_options_reach_the_refiner(pair, path, backend):
-    made = matcher(refiner=path, backend=backend, precision="fp32")
-    assert (made.refine.backend, made.refine.precision) == (backend, "fp32")
+    subject = matcher(refiner=path, backend=backend, precision="fp32")
+    assert (subject.refine.backend, subject.refine.precision) == (backend, "fp32")
     expected = LearnedRefiner(path, backend=backend, precision="fp32").fingerprint
-    assert made.refine.fingerprint == expected
-    assert made(*pair).disparity.shape == pair[0].shape
+    assert subject.refine.fingerprint == expected
+    assert subject(*pair).disparity.shape == pair[0].shape
 
 
 def test_unknown_options_are_refused_with_the_known_ones(path):
@@ -135,9 +133,9 @@ def test_errors_come_when_the_matcher_is_made(tmp_path, path):
         "must be one of auto, fp32": {"refiner": path, "precision": "fp8"},
         "must be its own": {"refiner": "cnn", "weights": path},
     }
-    for message, given in cases.items():
+    for message, arguments in cases.items():
         with pytest.raises(StereokitError, match=message) as caught:
-            matcher(**given)
+            matcher(**arguments)
         one_line(caught.value)
 
 
@@ -151,11 +149,11 @@ def test_a_sequence_is_single_calls_in_order(path):
     rng = np.random.default_rng(2)
     sizes = [(40, 64), (40, 64), (33, 47), (40, 64), (16, 50), (40, 64)]
     pairs = [tuple(rng.integers(0, 256, (2, *size)).astype(np.uint8)) for size in sizes]
-    made = matcher(refiner=path, threads=2)
+    subject = matcher(refiner=path, threads=2)
     expected = [matcher(refiner=path, threads=1)(*p) for p in pairs]
-    found = list(made.map(pairs))
-    assert len(found) == len(pairs)
-    for one, other in zip(found, expected, strict=True):
+    actual = list(subject.map(pairs))
+    assert len(actual) == len(pairs)
+    for one, other in zip(actual, expected, strict=True):
         np.testing.assert_array_equal(one.disparity, other.disparity)
         np.testing.assert_array_equal(one.valid, other.valid)
 
@@ -163,36 +161,36 @@ def test_a_sequence_is_single_calls_in_order(path):
 def test_match_uses_the_refiner_that_it_is_given(pair):
     options = {**METHOD, "method": "census+sgm"}
     refiners = [LearnedRefiner.of(random_content("cnn", seed, last=0.5)) for seed in (0, 1)]
-    found = [stereokit.match(*pair, refiner=refiner, **options) for refiner in refiners]
+    actual = [stereokit.match(*pair, refiner=refiner, **options) for refiner in refiners]
     expected = [matcher(refiner=refiner)(*pair).disparity for refiner in refiners]
-    np.testing.assert_array_equal(found[0], expected[0])
-    np.testing.assert_array_equal(found[1], expected[1])
+    np.testing.assert_array_equal(actual[0], expected[0])
+    np.testing.assert_array_equal(actual[1], expected[1])
 
 
 def test_gaps_survive_without_fill(pair, path):
     coarse_gaps = matcher(fill=None, median=0, smp=True)(*pair)
-    found = matcher(refiner=path, fill=None, median=0, smp=True)(*pair)
-    assert np.isnan(found.disparity).any()
-    assert not found.valid[np.isnan(found.disparity)].any()
-    assert np.isnan(coarse_gaps.disparity[np.isnan(found.disparity)]).all()
+    actual = matcher(refiner=path, fill=None, median=0, smp=True)(*pair)
+    assert np.isnan(actual.disparity).any()
+    assert not actual.valid[np.isnan(actual.disparity)].any()
+    assert np.isnan(coarse_gaps.disparity[np.isnan(actual.disparity)]).all()
 
 
 def test_negative_ranges_and_color_pairs(pair, path):
-    found = matcher(refiner=path, min_disparity=-16)(*(np.dstack([view] * 3) for view in pair))
-    assert found.disparity.shape == pair[0].shape
-    assert np.isfinite(found.disparity).all()
+    actual = matcher(refiner=path, min_disparity=-16)(*(np.dstack([view] * 3) for view in pair))
+    assert actual.disparity.shape == pair[0].shape
+    assert np.isfinite(actual.disparity).all()
 
 
 def test_the_right_view_is_refined_too(pair, path):
-    found = matcher(refiner=path, right=True)(*pair)
+    actual = matcher(refiner=path, right=True)(*pair)
     mirrored = matcher(refiner=path)(pair[1][:, ::-1].copy(), pair[0][:, ::-1].copy())
-    np.testing.assert_array_equal(found.right, mirrored.disparity[:, ::-1])
+    np.testing.assert_array_equal(actual.right, mirrored.disparity[:, ::-1])
 
 
 def test_a_pickled_matcher_is_the_same(pair, path):
-    made = matcher(refiner=path)
-    again = pickle.loads(pickle.dumps(made))
-    np.testing.assert_array_equal(again(*pair).disparity, made(*pair).disparity)
+    subject = matcher(refiner=path)
+    again = pickle.loads(pickle.dumps(subject))
+    np.testing.assert_array_equal(again(*pair).disparity, subject(*pair).disparity)
 
 
 def test_the_command_match_takes_a_weight_file(pair, path, tmp_path):

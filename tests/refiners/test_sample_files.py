@@ -40,11 +40,11 @@ def path(stored, tmp_path):
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_what_is_cached_is_what_was_made(pair, number, tmp_path, monkeypatch):
     folder = tmp_path / "not" / "there"
-    made = load_variant(pair, "S2", 0, number, 32, folder)
-    assert_same(made, load_variant(pair, "S2", 0, number, 32))
+    subject = load_variant(pair, "S2", 0, number, 32, folder)
+    assert_same(subject, load_variant(pair, "S2", 0, number, 32))
     assert [p.name for p in folder.iterdir()] == [cache_name(pair, "S2", 0, number, 32)]
     monkeypatch.setattr(samples, "make_variant", None)  # from here on only the cache can answer
-    assert_same(load_variant(pair, "S2", 0, number, 32, folder), made)
+    assert_same(load_variant(pair, "S2", 0, number, 32, folder), subject)
 
 
 def test_a_variant_is_stored_once_where_its_name_says(pair, tmp_path, monkeypatch):
@@ -58,7 +58,7 @@ def test_a_variant_is_stored_once_where_its_name_says(pair, tmp_path, monkeypatc
 
 
 def test_a_variant_that_was_interrupted_leaves_nothing(pair, tmp_path, monkeypatch):
-    def stopped(*given):
+    def stopped(*arguments):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(samples, "make_variant", stopped)
@@ -119,12 +119,12 @@ def test_a_shelf_reads_each_time_and_only_what_is_asked_for(path):
 )
 def test_slices_of_a_shelf_are_shelves(part, stored):
     shelf = SampleFiles(stored)
-    found = shelf[part]
-    assert isinstance(found, SampleFiles)
-    assert len(found) == len(stored[part])
-    for sample, path in zip(found, stored[part], strict=True):
+    actual = shelf[part]
+    assert isinstance(actual, SampleFiles)
+    assert len(actual) == len(stored[part])
+    for sample, path in zip(actual, stored[part], strict=True):
         assert_same(sample, SampleFiles([path])[0])
-    assert found.digest == SampleFiles(stored[part]).digest
+    assert actual.digest == SampleFiles(stored[part]).digest
 
 
 def test_a_slice_reads_nothing(tmp_path):
@@ -153,14 +153,14 @@ def test_a_shelf_trains_as_its_samples_do(stored, tmp_path):
     from stereokit_refiners.training.loop import Source, calibrated, restored
 
     network, shelf = NETWORKS["pyramid"], SampleFiles(stored)
-    kept = list(shelf)
+    original = list(shelf)
     checkpoint = tmp_path / "checkpoint.pt"
     arrays, history = fit(network, [Source(shelf)], shelf[:1], settings(steps=3), checkpoint=checkpoint)
-    expected, other = fit(network, [Source(kept)], kept[:1], settings(steps=3))
+    expected, other = fit(network, [Source(original)], original[:1], settings(steps=3))
     same_arrays(arrays, expected)
     assert history.rows == other.rows
     module = restored(network, arrays)
-    assert calibrated(module, "residual", [Source(shelf)]) == calibrated(module, "residual", [Source(kept)])
+    assert calibrated(module, "residual", [Source(shelf)]) == calibrated(module, "residual", [Source(original)])
     again = fit(network, [Source(SampleFiles(stored))], shelf[:1], settings(steps=3), checkpoint=checkpoint)
     same_arrays(again[0], arrays)
     with pytest.raises(ValueError, match="checkpoint"):

@@ -45,9 +45,9 @@ def arrays(sample):
 
 def assert_same(one, other):
     for name, array in arrays(one).items():
-        found = arrays(other)[name]
-        assert found.dtype == array.dtype, name
-        np.testing.assert_array_equal(found, array, err_msg=name)
+        actual = arrays(other)[name]
+        assert actual.dtype == array.dtype, name
+        np.testing.assert_array_equal(actual, array, err_msg=name)
     assert one.size == other.size
 
 
@@ -69,17 +69,17 @@ def test_variant_0_is_what_a_half_size_matcher_computes_inside(method, levels, s
     keeping = Keeping()
     options = {"max_disparity": levels, "scale": 0.5, "refiner": keeping, "confidence": True}
     stereokit.Matcher(method, **options)(pair.left, pair.right)
-    found = make_variant(pair, method, 0, 0, levels)
+    actual = make_variant(pair, method, 0, 0, levels)
     expected = np.clip(np.rint(keeping.coarse.disparity * 256), 0, 65535).astype(np.uint16)
-    np.testing.assert_array_equal(found.coarse, expected)
-    kept = np.clip(np.rint(keeping.coarse.candidates * 256), 0, 65535)
-    assert found.candidates.dtype == np.uint16
-    np.testing.assert_array_equal(found.candidates, kept)
-    assert found.confidence.dtype == np.uint8
-    np.testing.assert_array_equal(found.confidence, np.rint(keeping.coarse.confidence * 255))
-    assert (found.confidence[~keeping.coarse.valid] == 0).all() and len(np.unique(found.confidence)) > 20
-    assert found.size == size
-    np.testing.assert_array_equal(found.left[: size[0], : size[1]], pair.left)
+    np.testing.assert_array_equal(actual.coarse, expected)
+    original = np.clip(np.rint(keeping.coarse.candidates * 256), 0, 65535)
+    assert actual.candidates.dtype == np.uint16
+    np.testing.assert_array_equal(actual.candidates, original)
+    assert actual.confidence.dtype == np.uint8
+    np.testing.assert_array_equal(actual.confidence, np.rint(keeping.coarse.confidence * 255))
+    assert (actual.confidence[~keeping.coarse.valid] == 0).all() and len(np.unique(actual.confidence)) > 20
+    assert actual.size == size
+    np.testing.assert_array_equal(actual.left[: size[0], : size[1]], pair.left)
 
 
 def test_variant_0_does_not_depend_on_the_seed(pair, sample):
@@ -97,18 +97,18 @@ def test_the_truth_is_kept_in_256ths_and_hidden_pixels_are_told_apart(pair, samp
 def test_a_pixel_with_two_truths_takes_that_of_both_cameras(pair):
     mixed = Pair("x", pair.left, pair.right, pair.noc, np.where(np.isfinite(pair.occ), pair.occ + 5, NAN))
     mixed.occ.astype(np.float32)
-    found = make_variant(dataclasses.replace(mixed, occ=mixed.occ.astype(np.float32)), "S2", 0, 0, 32)
-    assert set(np.unique(found.truth[found.seen])) == {10 * 256}
-    assert set(np.unique(found.truth[~found.seen])) == {0, 15 * 256}
+    actual = make_variant(dataclasses.replace(mixed, occ=mixed.occ.astype(np.float32)), "S2", 0, 0, 32)
+    assert set(np.unique(actual.truth[actual.seen])) == {10 * 256}
+    assert set(np.unique(actual.truth[~actual.seen])) == {0, 15 * 256}
 
 
 def test_odd_sizes_are_extended_by_pixels_without_truth():
-    found = make_variant(pair_of((71, 119)), "S2", 0, 0, 32)
-    assert found.left.shape == found.truth.shape == (72, 120)
-    assert found.coarse.shape == (36, 60)
-    assert (found.truth[71] == 0).all() and (found.truth[:, 119] == 0).all()
-    np.testing.assert_array_equal(found.left[71], found.left[70])
-    np.testing.assert_array_equal(found.left[:, 119], found.left[:, 118])
+    actual = make_variant(pair_of((71, 119)), "S2", 0, 0, 32)
+    assert actual.left.shape == actual.truth.shape == (72, 120)
+    assert actual.coarse.shape == (36, 60)
+    assert (actual.truth[71] == 0).all() and (actual.truth[:, 119] == 0).all()
+    np.testing.assert_array_equal(actual.left[71], actual.left[70])
+    np.testing.assert_array_equal(actual.left[:, 119], actual.left[:, 118])
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
@@ -124,11 +124,11 @@ def test_variants_are_functions_of_pair_method_seed_and_number(pair, number):
 def test_rescaling_scales_the_truth_with_the_width(pair):
     widths = set()
     for number in range(1, 9):
-        found = make_variant(pair, "S2", 1, number, 64)
-        rows, columns = found.size
+        actual = make_variant(pair, "S2", 1, number, 64)
+        rows, columns = actual.size
         widths.add(columns)
         assert 64 <= columns <= round(120 * 1.6) and 64 <= rows <= round(72 * 1.6)
-        known = found.truth[:rows, :columns]
+        known = actual.truth[:rows, :columns]
         np.testing.assert_allclose(known[known > 0] / 256, 10 * columns / 120, atol=1 / 256)
         share = 0.75 if number % 2 else 0.75 * 100 / 120  # mirrored, what both cameras see
         assert abs((known > 0).mean() - share) < 0.05
@@ -137,9 +137,9 @@ def test_rescaling_scales_the_truth_with_the_width(pair):
 
 def test_the_coarse_map_of_a_variant_still_fits_its_truth(pair):
     for number in range(1, 5):
-        found = make_variant(pair, "S2", 2, number, 64)
-        columns = found.size[1]
-        inner = found.coarse[:, 14:-4] / 128  # beyond what is hidden by the border
+        actual = make_variant(pair, "S2", 2, number, 64)
+        columns = actual.size[1]
+        inner = actual.coarse[:, 14:-4] / 128  # beyond what is hidden by the border
         assert np.mean(np.abs(inner - 10 * columns / 120) < 1.5) > 0.9
 
 
@@ -149,9 +149,9 @@ def test_every_other_variant_is_of_the_mirrored_pair_and_all_but_0_are_changed_b
     def spied(name):
         real = getattr(samples, name)
 
-        def step(*given):
+        def step(*arguments):
             calls.append(name)
-            return real(*given)
+            return real(*arguments)
 
         return step
 
@@ -164,9 +164,9 @@ def test_every_other_variant_is_of_the_mirrored_pair_and_all_but_0_are_changed_b
 
 
 def test_the_pair_is_not_modified(pair):
-    kept = [np.copy(a) for a in (pair.left, pair.right, pair.noc, pair.occ)]
+    original = [np.copy(a) for a in (pair.left, pair.right, pair.noc, pair.occ)]
     make_variant(pair, "S2", 0, 1, 32)
-    for before, after in zip(kept, (pair.left, pair.right, pair.noc, pair.occ), strict=True):
+    for before, after in zip(original, (pair.left, pair.right, pair.noc, pair.occ), strict=True):
         np.testing.assert_array_equal(before, after)
 
 
@@ -214,11 +214,11 @@ def numbered(rows, columns):
     return Sample(coarse, confidence, candidates, left, truth, truth % 5 > 0, (2 * rows, 2 * columns))
 
 
-def assert_extended(found, kept):
+def assert_extended(actual, original):
     """Check candidates in full-size pixels against those of a sample, whose border stands for what is beyond it."""
-    _, rows, columns = kept.shape
-    for k, y, x in np.ndindex(found.shape):
-        assert found[k, y, x] == kept[k, min(y, rows - 1), min(x, columns - 1)] / 128
+    _, rows, columns = original.shape
+    for k, y, x in np.ndindex(actual.shape):
+        assert actual[k, y, x] == original[k, min(y, rows - 1), min(x, columns - 1)] / 128
 
 
 def test_crops_keep_map_truth_and_mask_together():

@@ -12,7 +12,6 @@ from refining import (
     coarse_of,
     encoded_of,
     image_of,
-    needs_backend,
     random_arrays,
     random_content,
     tuned_to_kitti,
@@ -23,8 +22,6 @@ from stereokit_refiners import learned
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.runtimes import reference
 from stereokit_refiners.weights import NETWORKS
-
-pytestmark = needs_backend
 
 SIZE = (32, 48)
 
@@ -63,10 +60,10 @@ def test_plain_numpy_is_torchs_network(name):
     from stereokit_refiners.runtimes.torch import runner
 
     inputs, arrays = encoded_of(name, 16, 32), random_arrays(name, last=1.0)
-    found = reference.forward(NETWORKS[name], arrays, inputs)
+    actual = reference.forward(NETWORKS[name], arrays, inputs)
     expected = runner(NETWORKS[name], arrays)(inputs)
-    assert found.shape == expected.shape and found.dtype == np.float32 and torch is not None
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+    assert actual.shape == expected.shape and actual.dtype == np.float32 and torch is not None
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16", "int8"])
@@ -80,7 +77,7 @@ def test_networks_tuned_to_kitti_pass_with_room(name, precision):
 
 def test_a_sound_runtime_is_checked_once_and_says_nothing(monkeypatch):
     calls = []
-    monkeypatch.setattr(learned, "mistake", lambda *given: calls.append(given) or reference.mistake(*given))
+    monkeypatch.setattr(learned, "mistake", lambda *arguments: calls.append(arguments) or reference.mistake(*arguments))
     for seed in (0, 1):
         refiner = LearnedRefiner.of(random_content("cnn", seed), precision="fp32")
         refiner(coarse_of(SIZE), image_of(SIZE))
@@ -96,10 +93,10 @@ def test_a_wrong_runtime_gives_way_to_another_with_one_warning(broken):
     rule = (
         rf"^network 'cnn' is run by {second} in fp32, since on this machine {first} in fp32 is off by 2 px on average$"
     )
-    with pytest.warns(RuntimeWarning, match=rule) as told:
-        refiner, found = refined(first)
-    assert len(told) == 1
-    np.testing.assert_array_equal(found, expected)
+    with pytest.warns(RuntimeWarning, match=rule) as messages:
+        refiner, actual = refined(first)
+    assert len(messages) == 1
+    np.testing.assert_array_equal(actual, expected)
     assert refiner.fingerprint.endswith(f"-{second}-fp32")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -113,8 +110,8 @@ def test_a_wrong_precision_gives_way_to_fp32_of_the_same_runtime(broken):
     with pytest.warns(
         RuntimeWarning, match="is run by openvino in fp32, since on this machine openvino in bf16 is off"
     ):
-        refiner, found = refined("openvino", precision="bf16")
-    np.testing.assert_array_equal(found, expected)
+        refiner, actual = refined("openvino", precision="bf16")
+    np.testing.assert_array_equal(actual, expected)
     assert refiner.fingerprint.endswith("-openvino-fp32")
 
 

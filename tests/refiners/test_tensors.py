@@ -36,34 +36,34 @@ def test_tensors_give_what_arrays_give(name, mode, size, device):
     content, coarse, left = random_content(name, output_mode=mode), coarse_of(size), image_of(size)
     expected = LearnedRefiner.of(content, backend="torch")(coarse, left).disparity
     refiner = TensorRefiner(content, device)
-    given = [
+    arguments = [
         torch.from_numpy(array).to(device) for array in (coarse.disparity, coarse.confidence, left, coarse.candidates)
     ]
-    kept = [tensor.clone() for tensor in given]
-    found = refiner(*given)
-    assert found.shape == size and found.dtype == torch.float32 and found.is_contiguous()
-    assert found.device.type == device
-    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=TOLERANCE_PX)
-    assert all(torch.equal(a, b) for a, b in zip(given, kept, strict=True))
+    original = [tensor.clone() for tensor in arguments]
+    actual = refiner(*arguments)
+    assert actual.shape == size and actual.dtype == torch.float32 and actual.is_contiguous()
+    assert actual.device.type == device
+    np.testing.assert_allclose(actual.cpu().numpy(), expected, rtol=0, atol=TOLERANCE_PX)
+    assert all(torch.equal(a, b) for a, b in zip(arguments, original, strict=True))
     again = refiner(coarse.disparity, coarse.confidence, left, coarse.candidates)  # arrays of the host are taken too
-    assert torch.equal(again, found)
+    assert torch.equal(again, actual)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tensors_below_zero_give_what_arrays_give(name):
     content, coarse, left = random_content(name), coarse_of((33, 47), low=-40, high=-5), image_of((33, 47))
     expected = LearnedRefiner.of(content, backend="torch")(coarse, left).disparity
-    found = TensorRefiner(content, "cpu")(coarse.disparity, coarse.confidence, left, coarse.candidates)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=TOLERANCE_PX)
+    actual = TensorRefiner(content, "cpu")(coarse.disparity, coarse.confidence, left, coarse.candidates)
+    np.testing.assert_allclose(actual.numpy(), expected, rtol=0, atol=TOLERANCE_PX)
 
 
 def test_only_networks_that_look_at_the_confidence_and_candidates_need_them():
     coarse, left = coarse_of((16, 24)), image_of((16, 24))
     for name in ("cnn", "stereovae"):
         refiner = TensorRefiner(random_content(name), "cpu")
-        given = refiner(coarse.disparity, coarse.confidence, left)
-        assert torch.equal(refiner(coarse.disparity, None, left), given)
-        assert torch.equal(refiner(coarse.disparity, None, left, coarse.candidates), given)
+        arguments = refiner(coarse.disparity, coarse.confidence, left)
+        assert torch.equal(refiner(coarse.disparity, None, left), arguments)
+        assert torch.equal(refiner(coarse.disparity, None, left, coarse.candidates), arguments)
     refiner = TensorRefiner(random_content("pyramid"), "cpu")
     with pytest.raises(InputError, match=r"^confidence must be given for refiner 'pyramid', got None$"):
         refiner(coarse.disparity, None, left, coarse.candidates)
@@ -85,8 +85,8 @@ def test_the_device_needs_torch(monkeypatch):
 
 def test_a_file_is_taken_by_its_path(tmp_path):
     path = weight_file(tmp_path, "cnn")
-    given = coarse_of((16, 16)).disparity, coarse_of((16, 16)).confidence, image_of((16, 16))
-    assert torch.equal(TensorRefiner(path, "cpu")(*given), TensorRefiner(random_content("cnn"), "cpu")(*given))
+    arguments = coarse_of((16, 16)).disparity, coarse_of((16, 16)).confidence, image_of((16, 16))
+    assert torch.equal(TensorRefiner(path, "cpu")(*arguments), TensorRefiner(random_content("cnn"), "cpu")(*arguments))
     with pytest.raises(FileError, match="weights must name a file"):
         TensorRefiner(str(tmp_path / "none.safetensors"), "cpu")
     with pytest.raises(FileError):
@@ -103,12 +103,12 @@ def test_devices_that_torch_lacks_are_refused():
 def test_sizes_that_do_not_fit_are_refused():
     refiner = TensorRefiner(random_content("cnn"), "cpu")
     coarse, confidence, left = torch.zeros(8, 8), torch.ones(8, 8), torch.zeros(16, 16, dtype=torch.uint8)
-    for given in (
+    for arguments in (
         (coarse[:7], confidence, left),
         (coarse, confidence, left[None]),
         (coarse, confidence[:7], left),
         (left, confidence, left),
     ):
         with pytest.raises(InputError) as caught:
-            refiner(*given)
+            refiner(*arguments)
         one_line(caught.value)

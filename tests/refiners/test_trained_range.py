@@ -8,7 +8,7 @@ import warnings
 import cv2
 import numpy as np
 import pytest
-from refining import NAMES, coarse_of, image_of, needs_backend, random_content, sure, tuned_to_kitti
+from refining import NAMES, coarse_of, image_of, random_content, sure, tuned_to_kitti
 
 import stereokit
 from stereokit import Matcher
@@ -16,8 +16,6 @@ from stereokit.errors import StereokitWarning
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.runtimes.encode import BEGINNING, base_of
-
-pytestmark = needs_backend
 
 HEIGHT, WIDTH = 128, 512
 OFFSETS = (0, 60, 120, 200)
@@ -30,7 +28,7 @@ class Keeper:
     needs_confidence = needs_candidates = True
 
     def __call__(self, coarse, left, *, threads=1):
-        self.given = coarse, left.copy()
+        self.arguments = coarse, left.copy()
         return stereokit.REFINERS.get("linear")()(coarse, left, threads=threads)
 
 
@@ -42,7 +40,7 @@ def coarse_maps():
     truth = 6 + 30 * (y / HEIGHT) ** 2 + 8 * ((x > 300) & (x < 380) & (y > 40)).astype(np.float32)
     coarse = np.kron(rng.normal(size=(HEIGHT // 4, WIDTH // 4 + 100)), np.ones((4, 4))) * 40
     texture = cv2.GaussianBlur(coarse + rng.normal(size=coarse.shape) * 30, (0, 0), 0.9).astype(np.float32) + 120
-    found = {}
+    actual = {}
     for offset in OFFSETS:
         # The left view stays, the right one shows what lies further to the right.
         views = (
@@ -53,8 +51,8 @@ def coarse_maps():
         keeper = Keeper()
         matcher = Matcher("S4", max_disparity=256, scale=0.5, refiner=keeper)
         matcher(*(np.clip(np.rint(view), 0, 255).astype(np.uint8) for view in noisy))
-        found[offset] = keeper.given
-    return truth, found
+        actual[offset] = keeper.arguments
+    return truth, actual
 
 
 @pytest.mark.parametrize("name", ["linear", *NAMES])
@@ -136,8 +134,8 @@ def test_disparities_beyond_the_training_are_warned_of_once():
     left = image_of((64, 96))
     refiner = LearnedRefiner.of(content, precision="fp32")
     assert refiner.trained_disparities == (0, 128)
-    told = messages(lambda: refiner(sure(ramp), left))
-    assert len(told) == 1 and "128 px" in told[0] and "linear" in told[0] and "\n" not in told[0]
+    notices = messages(lambda: refiner(sure(ramp), left))
+    assert len(notices) == 1 and "128 px" in notices[0] and "linear" in notices[0] and "\n" not in notices[0]
     assert messages(lambda: refiner(sure(ramp), left)) == []  # once is enough
     wider = dataclasses.replace(content, notes={"disparities": [0, 256]})
     refiner = LearnedRefiner.of(wider, precision="fp32")

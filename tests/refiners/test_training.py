@@ -28,8 +28,8 @@ from stereokit_refiners.weights import NETWORKS, WeightFile  # noqa: E402
 TINY = {"steps": 7, "batch": 1, "rows": 8, "columns": 16, "evaluate_every": 2, "half": False, "seed": 3}
 
 
-def settings(**given):
-    return Settings(**{**TINY, **given})
+def settings(**arguments):
+    return Settings(**{**TINY, **arguments})
 
 
 def sample_of(seed=0, size=(24, 40), offset=6.0, known=0.8):
@@ -85,12 +85,12 @@ def test_the_papers_recipe():
     assert (paper.output_mode, paper.loss, paper.finish, paper.divergence) == ("direct", "l1", None, 256)
     assert (paper.decay, paper.clip, paper.ema, paper.patience) == (0, 0, 0, 0)
     for step, times in ((0, 0), (1599, 0), (1600, 1), (3200, 2), (159_999, 99)):
-        assert loop._rate(paper, step) == pytest.approx(5e-4 * 0.97**times)
+        assert loop._rate_factor(paper, step) == pytest.approx(0.97**times)
 
 
 def test_the_default_schedule_warms_up_and_ends_near_nothing():
     chosen = Settings(steps=1000, learning_rate=2e-3)
-    rates = [loop._rate(chosen, step) for step in range(1000)]
+    rates = [chosen.learning_rate * loop._rate_factor(chosen, step) for step in range(1000)]
     assert rates[0] < 0.02 * max(rates)
     assert max(rates) == pytest.approx(2e-3, rel=0.05)
     assert np.argmax(rates) < 110
@@ -99,7 +99,7 @@ def test_the_default_schedule_warms_up_and_ends_near_nothing():
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"output_mode": "printed"}, "output_mode must be one of residual, direct, got 'printed'"),
         ({"loss": "l2"}, "loss must be one of l1, bounded, d1, got 'l2'"),
@@ -112,14 +112,14 @@ def test_the_default_schedule_warms_up_and_ends_near_nothing():
         ({"columns": 20}, "rows and columns must be multiples of 8, got 8 and 20"),
     ],
 )
-def test_settings_are_checked(given, message):
+def test_settings_are_checked(arguments, message):
     with pytest.raises(OptionError) as caught:
-        settings(**given)
+        settings(**arguments)
     assert one_line(caught.value) == message
 
 
 @pytest.mark.parametrize(
-    "given",
+    "arguments",
     [
         {"steps": 2.5}, {"batch": 1.5}, {"learning_rate": -1.0}, {"learning_rate": float("nan")}, {"ema": 1.5},
         {"ema": -0.1}, {"decay": -1.0}, {"clip": -1.0}, {"patience": -1}, {"patience": 1.5}, {"divergence": -1.0},
@@ -127,10 +127,10 @@ def test_settings_are_checked(given, message):
     ],
     ids=str,
 )  # fmt: skip
-def test_settings_that_no_training_could_use_are_refused_before_it_starts(given):
+def test_settings_that_no_training_could_use_are_refused_before_it_starts(arguments):
     with pytest.raises(StereokitError) as caught:
-        settings(**given)
-    assert next(iter(given)) in one_line(caught.value)
+        settings(**arguments)
+    assert next(iter(arguments)) in one_line(caught.value)
 
 
 # --- the pieces ----------------------------------------------------------------------------------------------------
@@ -150,9 +150,9 @@ def test_bad_pixels_are_those_of_kitti(occluded):
     error = rng.choice([0, 2.9, 3.0, 3.1, 5.0, 12.0], truth.shape) * rng.choice([-1, 1], truth.shape)
     estimate = (truth + error).astype(np.float32)
     wanted = truth if occluded else np.where(sample.seen[:23, :39], truth, 0)
-    found = bad_pixels(estimate, sample, occluded=occluded)
-    assert found == oracles.outliers(estimate, wanted)
-    assert 0 < found[0] < found[1]
+    actual = bad_pixels(estimate, sample, occluded=occluded)
+    assert actual == oracles.outliers(estimate, wanted)
+    assert 0 < actual[0] < actual[1]
 
 
 def test_exactly_3_pixels_and_exactly_5_percent_are_good():
@@ -175,13 +175,13 @@ def test_predict_is_what_the_refiner_computes(name, mode, size):
     pytest.importorskip("safetensors")
     arrays, sample = random_arrays(name, 1), sample_of(1, size)
     module = loop.restored(NETWORKS[name], arrays)
-    found = predict(module, mode, sample)
-    assert found.shape == size
-    assert found.dtype == np.float32
+    actual = predict(module, mode, sample)
+    assert actual.shape == size
+    assert actual.dtype == np.float32
     refiner = LearnedRefiner.of(WeightFile(name, mode, arrays), backend="torch")
     coarse = coarse_map(sample)
     image = np.ascontiguousarray(sample.left[: size[0], : size[1]])
-    np.testing.assert_allclose(found, refiner(coarse, image).disparity, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(actual, refiner(coarse, image).disparity, rtol=0, atol=2e-3)
 
 
 def test_predict_leaves_the_module_as_it_was():
@@ -293,14 +293,14 @@ def test_the_average_is_the_exponential_moving_one():
     same = {"schedule": "paper", "learning_rate": 1e-2}  # so that the first steps do not depend on how many follow
     initial = loop.Module(network, torch.Generator().manual_seed(3)).arrays()
     trained = [fit(network, SOURCES, [], settings(steps=n, ema=0.0, **same))[0] for n in (1, 2, 3)]
-    found, _ = fit(network, SOURCES, [], settings(steps=3, ema=0.15, **same))
+    actual, _ = fit(network, SOURCES, [], settings(steps=3, ema=0.15, **same))
     for name, array in initial.items():
         average = array.astype(np.float64)
         for step, weights in enumerate(trained):
             keep = min(0.15, (step + 1) / (step + 10))  # shorter at first
             average = keep * average + (1 - keep) * weights[name]
-        np.testing.assert_allclose(found[name], average, rtol=1e-5, atol=1e-7)
-    assert differ(found, trained[-1])
+        np.testing.assert_allclose(actual[name], average, rtol=1e-5, atol=1e-7)
+    assert differ(actual, trained[-1])
 
 
 @pytest.mark.parametrize("patience", [0, 3])
@@ -316,9 +316,9 @@ def test_a_run_that_was_stopped_at_any_step_goes_on_as_if_nothing_had_happened(s
     with pytest.raises(KeyboardInterrupt):
         fit(network, SOURCES, SAMPLES, chosen, checkpoint=path, save_every_s=-1, progress=stop)
     seen = []
-    found, resumed = fit(network, SOURCES, SAMPLES, chosen, checkpoint=path, save_every_s=-1,
+    actual, resumed = fit(network, SOURCES, SAMPLES, chosen, checkpoint=path, save_every_s=-1,
                          progress=lambda *a: seen.append(a[0]))  # fmt: skip
-    assert_same(expected, found)
+    assert_same(expected, actual)
     assert seen == list(range(stop_at, 8))  # what was not saved is done again, and nothing else
     assert [(r[0], r[2]) for r in resumed.rows] == [(r[0], r[2]) for r in history.rows]
 
@@ -357,12 +357,12 @@ def test_a_finished_run_is_not_run_again(tmp_path):
 def test_a_checkpoint_of_other_settings_is_refused(changed, tmp_path):
     path = tmp_path / "checkpoint.pt"
     fit(NETWORKS["cnn"], SOURCES, [], settings(steps=1), checkpoint=path)
-    kept = path.read_bytes()
+    original = path.read_bytes()
     with pytest.raises(OptionError, match=r"checkpoint .* is of other settings; remove it or choose another folder"):
         fit(NETWORKS["cnn"], SOURCES, [], settings(**{"steps": 1, **changed}), checkpoint=path)
     with pytest.raises(OptionError, match="other settings"):
         fit(NETWORKS["stereovae"], SOURCES, [], settings(steps=1), checkpoint=path)
-    assert path.read_bytes() == kept
+    assert path.read_bytes() == original
 
 
 @pytest.mark.parametrize("what", ["samples", "validation", "start"])
@@ -465,11 +465,11 @@ def test_crops_without_any_truth_do_no_harm():
 
 
 def test_progress_is_told_every_step():
-    told = []
-    fit(NETWORKS["cnn"], SOURCES, SAMPLES, settings(), progress=lambda *a: told.append(a))
-    assert [step for step, _, _ in told] == list(range(1, 8))
-    assert all(np.isfinite(loss) for _, loss, _ in told)
-    assert told[0][2] is None and told[1][2] is not None
+    messages = []
+    fit(NETWORKS["cnn"], SOURCES, SAMPLES, settings(), progress=lambda *a: messages.append(a))
+    assert [step for step, _, _ in messages] == list(range(1, 8))
+    assert all(np.isfinite(loss) for _, loss, _ in messages)
+    assert messages[0][2] is None and messages[1][2] is not None
 
 
 def test_the_history_is_a_csv_file():

@@ -42,14 +42,14 @@ def test_what_is_written_is_read(name, tmp_path):
     content = WeightFile(name, "residual", random_arrays(name), ranges, {"seed": 3, "words": ["a", None]})
     path = tmp_path / "w.safetensors"
     write(path, content)
-    found = read(path)
-    assert (found.network, found.output_mode) == (name, "residual")
-    assert found.ranges == ranges
-    assert found.notes == {"seed": 3, "words": ["a", None]}
-    assert set(found.arrays) == set(content.arrays)
+    actual = read(path)
+    assert (actual.network, actual.output_mode) == (name, "residual")
+    assert actual.ranges == ranges
+    assert actual.notes == {"seed": 3, "words": ["a", None]}
+    assert set(actual.arrays) == set(content.arrays)
     for key, array in content.arrays.items():
-        np.testing.assert_array_equal(found.arrays[key], array)
-    assert found.fingerprint == content.fingerprint
+        np.testing.assert_array_equal(actual.arrays[key], array)
+    assert actual.fingerprint == content.fingerprint
     assert [p.name for p in tmp_path.iterdir()] == ["w.safetensors"]
     assert path.stat().st_size < 1_000_000
 
@@ -200,10 +200,10 @@ def test_the_pyramid_has_no_direct_mode(tmp_path):
 def test_a_file_that_stands_stays_when_writing_fails(tmp_path):
     path = tmp_path / "w.safetensors"
     write(path, random_content("cnn"))
-    kept = path.read_bytes()
+    original = path.read_bytes()
     with pytest.raises(FileError):
         write(path, WeightFile("cnn", "residual", {}))
-    assert path.read_bytes() == kept
+    assert path.read_bytes() == original
 
 
 def test_files_that_call_the_output_mode_a_form_are_read(tmp_path):

@@ -1,8 +1,7 @@
 """Synthetic stereo cameras with exact truth: a scene of which every ray's depth is known, seen through any lens.
 
-A raw image is made pixel by pixel: the lens model is inverted (`cv2.undistortPoints`, or Newton's method for what that
-leaves), the ray meets the scene, and the scene's texture is an exact function of the point that it meets. Nothing of
-stereokit is used.
+A raw image is drawn pixel by pixel: the lens model is inverted (`cv2.undistortPoints`, to 1e-12), the ray meets the
+scene, and the scene's texture is an exact function of the point that it meets. Nothing of stereokit is used.
 """
 
 from __future__ import annotations
@@ -87,12 +86,17 @@ def _all_rays(rig: Rig, side: int, size: tuple[int, int]) -> np.ndarray:
         flat = cv2.fisheye.undistortPoints(pixels, k, d).reshape(-1, 2)
     else:
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-        flat = cv2.undistortPoints(pixels, k, d if len(d) else None, criteria=criteria).reshape(-1, 2)
+        coefficients, same = d if len(d) else np.zeros(5), np.eye(3)
+        if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+            flat = cv2.undistortPointsIter(pixels, k, coefficients, same, same, criteria)
+        else:
+            flat = cv2.undistortPoints(pixels, k, coefficients, criteria=criteria)
+        flat = flat.reshape(-1, 2)
     return np.concatenate([flat, np.ones((len(flat), 1))], axis=1).reshape(size[1], size[0], 3)
 
 
 def texture(points: np.ndarray) -> np.ndarray:
-    """Return the grey level, 0 to 255, of points in space: waves of many directions and lengths, each with its phase."""
+    """Return the grey level, 0 to 255, of points in space: waves of many directions and lengths."""
     rng = np.random.default_rng(5)
     level = np.zeros(points.shape[:-1])
     for _ in range(60):
@@ -151,7 +155,7 @@ def board_pose(number: int, count: int, center: np.ndarray, distance=0.45) -> tu
 
 
 def board_image(rig: Rig, side: int, pose, draw, size=SIZE) -> np.ndarray:
-    """Return the raw image of a board, uint8; `draw` gives levels from 0 to 1 for places on it and a pixel's width there."""
+    """Return the raw image of a board, uint8; `draw` gives levels, 0 to 1, of places on it, a pixel being so wide."""
     turn, step = (np.eye(3), np.zeros(3)) if side == 0 else (rig.r, rig.t)
     turn, step = turn @ pose[0], turn @ pose[1] + step
     directions = rays(rig, side, size) @ turn  # in the board's frame

@@ -68,10 +68,10 @@ def test_without_a_writable_cache_kernels_are_kept_among_the_temporary_files(pac
     (warning,) = use(package, tmp_path, tmp_path / "file")
     user = f"stereokit-{os.getuid()}" if hasattr(os, "getuid") else "stereokit"
     assert str(tmp_path / user) in warning and "NUMBA_CACHE_DIR" in warning
-    kept = {path: path.read_bytes() for path in (tmp_path / user).rglob("*.nb*")}
-    assert any("fill_rows" in path.name for path in kept) and any("_literal" in path.name for path in kept)
+    contents = {path: path.read_bytes() for path in (tmp_path / user).rglob("*.nb*")}
+    assert any("fill_rows" in path.name for path in contents) and any("_literal" in path.name for path in contents)
     use(package, tmp_path, None)
-    assert kept == {path: path.read_bytes() for path in (tmp_path / user).rglob("*.nb*")}  # not compiled again
+    assert contents == {path: path.read_bytes() for path in (tmp_path / user).rglob("*.nb*")}  # not compiled again
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs users")
@@ -137,8 +137,8 @@ def test_code_that_was_changed_within_a_file_is_not_run(kernels, tmp_path):
     double(kernels())
     (path,) = (tmp_path / "cache").rglob("*.nbc")
     content = bytearray(path.read_bytes())
-    at = content.index(b"\x7fELF") if b"\x7fELF" in content else len(content) // 2
-    content[at + 64 : at + 128] = bytes(64)
+    offset = content.index(b"\x7fELF") if b"\x7fELF" in content else len(content) // 2
+    content[offset + 64 : offset + 128] = bytes(64)
     path.write_bytes(content)
     assert not double(kernels())
     assert double(kernels())

@@ -117,7 +117,7 @@ def test_bad_pairs_are_named_and_left_out():
 def test_edges_of_a_blurred_board_are_wide():
     _, pairs = drawn("pinhole 5", "chess", 12)
     blurred = [(name, cv2.GaussianBlur(left, (0, 0), 2.6), right) for name, left, right in pairs]
-    with pytest.raises(InputError, match="at least 4 pairs must show the board well.*blurred in left"):
+    with pytest.raises(InputError, match=r"at least 4 pairs must show the board well.*blurred in left"):
         calibrate(blurred, CHESS)
 
 
@@ -147,7 +147,7 @@ def test_what_cannot_be_calibrated_says_why():
     name, left, right = pairs[0]
     with pytest.raises(InputError, match="one size, got 480x360 and, in pair '00', 240x180"):
         calibrate([(name, left, right[::2, ::2])], CHESS)
-    with pytest.raises(OptionError, match="to the left of the left one .*exchanged"):
+    with pytest.raises(OptionError, match=r"to the left of the left one .*exchanged"):
         calibrate([(name, right, left) for name, left, right in pairs], CHESS)
     for options, words in (
         ({"model": "omni"}, "model must be"),
@@ -159,7 +159,8 @@ def test_what_cannot_be_calibrated_says_why():
 
 def test_boards_are_checked():
     for arguments, words in (
-        ((2, 6, 0.02), "columns must be from 3"), ((9, 6, 0), "square_m must be"), ((9, 6, 0.02, 0.03), "smaller than a square"),
+        ((2, 6, 0.02), "columns must be from 3"), ((9, 6, 0), "square_m must be"),
+        ((9, 6, 0.02, 0.03), "smaller than a square"),
         ((9, 6, 0.02, 0.01, "4X4_5"), "no dictionary named '4X4_5'; did you mean '4X4_50'"),
     ):  # fmt: skip
         with pytest.raises(OptionError, match=words):

@@ -160,7 +160,7 @@ def test_json(tmp_path):
         (MIDDLEBURY.replace("999.421 0 294.182", "999.421 0"), "cam0 must hold 9 numbers, got 8"),
         (MIDDLEBURY.replace("193.001", "wide"), "baseline must hold 1 numbers, got 'wide'"),
         (MIDDLEBURY.replace("741", "inf"), "width must hold finite numbers"),
-        (MIDDLEBURY.replace("193.001", "-1"), "baseline_m must be positive"),
+        (MIDDLEBURY.replace("193.001", "-1"), "baseline must be positive, got -1"),
         (KITTI.replace("P_rect_03", "P_rect_04"), "no field 'P_rect_03'"),
         ("P0: 1 2 3\n", "no field 'P2'"),
         ("P2: 1 2 3\nP3: 1 2 3\n", "P2 must hold 12 numbers, got 3"),
@@ -184,7 +184,7 @@ def test_errors_name_the_file_and_the_field(tmp_path, text, message):
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(FileError, match="no such file"):
         read_calibration(tmp_path / "missing.txt")
-    with pytest.raises(FileError, match="cannot read"):
+    with pytest.raises(FileError, match="no calibration in the folder"):
         read_calibration(tmp_path)
     (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(FileError, match="not a text file"):
@@ -238,8 +238,8 @@ def test_what_contradicts_itself_is_refused(tmp_path, text, message):
 def test_what_differs_by_rounding_is_taken(tmp_path):
     path = tmp_path / "calib.txt"
     path.write_text(LEFT + RIGHT.replace("700 0", "700.3 0.2").replace("80", "80.4") + "doffs=40.3\nbaseline=120\n")
-    found = read_calibration(path)
-    assert (found.fx, found.cy, found.doffs) == (700, 80, pytest.approx(40.3))
+    calibration = read_calibration(path)
+    assert (calibration.fx, calibration.cy, calibration.doffs) == (700, 80, pytest.approx(40.3))
 
 
 @pytest.mark.parametrize("change", [lambda b: b"\xef\xbb\xbf" + b, lambda b: b.replace(b"\n", b"\r\n")])
@@ -272,21 +272,90 @@ def test_sizes_may_be_whole_numbers_of_any_type():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("%YAML:1.0\n---\nP2: !!opencv-matrix\n   rows: 3\n", r"OpenCV calibration \(YAML\)"),
-        ('<?xml version="1.0"?>\n<opencv_storage>\n<M1></M1>\n', r"OpenCV calibration \(XML\)"),
-        ('{"M1": {"type_id": "opencv-matrix", "rows": 3}}', r"OpenCV calibration \(JSON\)"),
-        ("image_width: 400\ncamera_name: right\nprojection_matrix:\n  rows: 3\n", "ROS camera_info"),
-        ("cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0, 0]\n", "Kalibr"),
-        ("[LEFT_CAM_HD]\nfx=700\n[STEREO]\nBaseline=120\n", "ZED"),
-        ('{"extrinsic": {"baseline": 0.2}, "intrinsic": {"fx": 2262}}', "Cityscapes"),
-        ("700 0 200 0 700 80 0 0 1\n0.12\n", "bare numbers"),
+        ("%YAML:1.0\n---\nP2: !!opencv-matrix\n   rows: 3\n", "no calibration known here; known are OpenCV's YAML"),
+        ('<?xml version="1.0"?>\n<opencv_storage>\n<M1></M1>\n', "not valid XML"),
+        ('<?xml version="1.0"?>\n<opencv_storage>\n<M1>3</M1></opencv_storage>\n', "no calibration known here"),
+        ('{"M1": {"type_id": "opencv-matrix", "rows": 3}}', "no calibration known here; known are .*Middlebury"),
+        (
+            "image_width: 400\ncamera_name: right\nprojection_matrix:\n  rows: 3\n",
+            "ROS camera_info file without the rect",
+        ),
+        ("cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0, 0]\n  intrinsics: [1, 2]\n", "no camera 'cam1'"),
+        ("[LEFT_CAM_HD]\nfx=700\n[STEREO]\nBaseline=120\n", "LEFT_CAM_HD.* has no fy"),
+        ('{"extrinsic": {"baseline": 0.2}, "intrinsic": {"fx": 2262}}', "no field 'fy', which a Cityscapes"),
+        ("700 0 200 0 700 80 0 0 1\n", "nine numbers of a camera matrix, but no baseline"),
+        ("700 0 200 0 700 80 0 0 1 2 3\n", "nine numbers of a camera matrix and the baseline, got 11"),
+        ("model: pinhole\nleftToRight:\n  x: 3\n", "looks like a BoofCV calibration, which is not read; known are"),
     ],
 )
-def test_files_of_others_are_called_by_their_names(tmp_path, text, words):
+def test_parts_of_files_of_others_say_what_is_missing(tmp_path, text, words):
     path = tmp_path / "calib.txt"
     path.write_text(text)
-    with pytest.raises(FileError, match=f"looks like .*{words}.*; known are Middlebury.*KITTI.*JSON with fx"):
+    with pytest.raises(FileError, match=words) as caught:
         read_calibration(path)
+    assert "calib.txt" in str(caught.value) and "\n" not in str(caught.value)
+
+
+P1 = np.array([[700.0, 0, 200, 0], [0, 700, 80, 0], [0, 0, 1, 0]])
+P2 = P1 + np.array([[0, 0, 12, -84.0], [0] * 4, [0] * 4])
+Q = Calibration(fx=700, fy=700, cx0=200, cy=80, baseline_m=0.12, cx1=212).Q
+
+
+def opencv(suffix, **entries):
+    file = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    for name, value in entries.items():
+        file.write(name, value)
+    return file.releaseAndGetString()
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+@pytest.mark.parametrize(
+    "entries", [{"P1": P1, "P2": P2}, {"Q": Q}, {"P_left": P1, "P_right": P2, "Q": Q}, {"PL": P1, "PR": P2}]
+)
+def test_a_pair_that_opencv_rectified(tmp_path, suffix, entries):
+    path = tmp_path / f"stereo{suffix}"
+    path.write_text(opencv(suffix, **entries))
+    camera = read_calibration(path)
+    assert (camera.fx, camera.fy, camera.cx0, camera.cy) == (700, 700, 200, 80)
+    assert (camera.doffs, camera.baseline_m) == (pytest.approx(12), pytest.approx(0.12))
+    path.write_text(opencv(suffix, imageWidth=400, imageHeight=160, **entries))
+    assert read_calibration(path).width is None  # of the raw images, which these need not be
+
+
+def test_a_pair_of_ros_files_or_the_right_one_with_its_left(tmp_path):
+    paths = tmp_path / "left.yaml", tmp_path / "right.yaml"
+    for path, p in zip(paths, (P1, P2), strict=True):
+        data = ", ".join(map(str, p.ravel()))
+        path.write_text(
+            f"image_width: 400\nimage_height: 160\nprojection_matrix:\n  rows: 3\n  cols: 4\n  data: [{data}]\n"
+        )
+    for camera in (read_calibration(paths[0], right=paths[1]), read_calibration(tmp_path)):
+        assert (camera.fx, camera.doffs, camera.baseline_m) == (700, 12, pytest.approx(0.12))
+    with pytest.raises(FileError, match=r"both of left.yaml and right.yaml"):
+        read_calibration(paths[0])
+    with pytest.raises(FileError, match="exchanged"):
+        read_calibration(paths[1], right=paths[0])
+
+
+def test_raw_cameras_are_no_rectified_pair(tmp_path):
+    k = np.array([[700.0, 0, 200], [0, 700, 80], [0, 0, 1]])
+    path = tmp_path / "stereo.yml"
+    path.write_text(opencv(".yml", K1=k, K2=k, R=np.eye(3), T=np.array([[-0.12], [0], [0]])))
+    with pytest.raises(
+        FileError, match=r"of raw cameras: its images must be rectified first, which .*read_rig and --rig do"
+    ):
+        read_calibration(path)
+
+
+def test_millimetres_are_told(tmp_path):
+    path = tmp_path / "K.txt"
+    path.write_text("700 0 200 0 700 80 0 0 1\n60\n")
+    with pytest.warns(StereokitWarning, match="baseline of 60, which is taken for millimetres .0.06 m"):
+        assert read_calibration(path).baseline_m == pytest.approx(0.06)
+    assert read_calibration(path, unit="mm").baseline_m == pytest.approx(0.06)
+    assert read_calibration(path, unit="cm").baseline_m == pytest.approx(0.6)
+    path.write_text(MIDDLEBURY)  # whose unit is known
+    assert read_calibration(path).baseline_m == pytest.approx(0.193001)
 
 
 def test_odd_figures_are_warned_of(tmp_path):

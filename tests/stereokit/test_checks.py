@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import stereokit
+from stereokit.checks import check_gray as check
 from stereokit.checks import density_warnings, min_density, same_pixels
 from stereokit.errors import StereokitWarning
 from stereokit.notices import PairWarning, collecting, warn
@@ -49,13 +50,24 @@ def test_a_bad_pair_has_one_warning(matcher, left, right, words):
         matcher(left, right)
     assert len(caught) == 1 and len(str(caught[0].message).splitlines()) == 1
     assert caught[0].filename == __file__  # where the package was called
-    with pytest.warns(PairWarning, match=words):
+    with pytest.warns(PairWarning, match=f"{words}|only"):  # its matcher lives on, and looks closely ever more rarely
         stereokit.match(left, right, "S2", **OPTIONS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with collecting() as lines:
             matcher(left, right)
     assert len(lines) == 1
+
+
+def test_a_matcher_looks_closely_ever_more_rarely(matcher, monkeypatch):
+    looked = []
+    monkeypatch.setattr("stereokit.checks.check_gray", lambda *_, **__: looked.append(calls) or check(*_, **__))
+    for calls in range(1, 10):  # noqa: B007, which `look` reads
+        with collecting() as lines:
+            matcher(RIGHT, LEFT)
+            matcher(LEFT, RIGHT)  # a good one is not looked at
+        assert len(lines) == 1
+    assert looked == [1, 2, 4, 8]
 
 
 def test_a_sequence_is_warned_of_once(matcher):
@@ -78,8 +90,8 @@ def test_density_decides():
     assert [min_density(levels) for levels in (2048, 128, 64, 32, 16, 8, 1)] == [0.3, 0.3, 0.35, 0.4, 0.45, 0.45, 0.45]
     for measured, number in ((0, "0.0 %"), (9, "9.0 %"), (34, "34 %"), (35, None), (100, None)):
         valid = (np.arange(100) < measured).reshape(10, 10)
-        found = Disparity(np.zeros((10, 10), np.float32), valid)
-        lines = density_warnings(found.density, -4, 60)
+        result = Disparity(np.zeros((10, 10), np.float32), valid)
+        lines = density_warnings(result.density, -4, 60)
         assert (not lines) if number is None else (f"only {number}" in lines[0] and "-4 .. 59" in lines[0])
 
 

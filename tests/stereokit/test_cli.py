@@ -28,7 +28,7 @@ CALIBRATION = {"fx": 100, "fy": 100, "cx0": 0, "cy": 0, "baseline_m": 0.1}
 class FakeMatcher:
     """Finds disparity 10 everywhere but in the first column, and remembers how it was called."""
 
-    made: ClassVar[list[dict]] = []
+    instances: ClassVar[list[dict]] = []
     called = 0
     confident = True
     raises: BaseException | None = None
@@ -36,7 +36,7 @@ class FakeMatcher:
     def __init__(self, method="census+sgm", **options):
         if options.get("p1") == "bad":
             raise OptionError("p1 must be a number, got 'bad'")
-        FakeMatcher.made.append({"method": method, **options})
+        FakeMatcher.instances.append({"method": method, **options})
         self.method = {"S2": "census+sgm"}.get(method, method)
         self.max_disparity, self.min_disparity = options["max_disparity"], options["min_disparity"]
         self.refiner = options["refiner"]
@@ -56,9 +56,10 @@ class FakeMatcher:
 def matching(monkeypatch):
     module = types.ModuleType("stereokit.matching")
     module.Matcher = FakeMatcher
+    module.compile_kernels = lambda matcher, *kind: matcher(*[np.zeros((4, 4), np.uint8)] * 2)
     module.METHODS = {"S1": "census+dt", "S2": "census+sgm", "S3": "zncc+dt", "S4": "zncc+sgm"}
     monkeypatch.setitem(sys.modules, "stereokit.matching", module)
-    monkeypatch.setattr(FakeMatcher, "made", [])
+    monkeypatch.setattr(FakeMatcher, "instances", [])
     for name, value in (("called", 0), ("confident", True), ("raises", None)):
         monkeypatch.setattr(FakeMatcher, name, value)
 
@@ -117,7 +118,7 @@ def test_match_writes_the_map(tmp_path, pair, suffix):
     np.testing.assert_array_equal(io.read_disparity(output), expected)
     assert "census+sgm" in result.stdout
     assert "87.5 %" in result.stdout
-    assert FakeMatcher.made == [
+    assert FakeMatcher.instances == [
         {
             "method": "census+sgm",
             "max_disparity": 128,
@@ -148,7 +149,7 @@ def test_match_passes_every_option(tmp_path, pair):
         ),
     )
     assert result.exit_code == 0, result.output
-    assert FakeMatcher.made == [
+    assert FakeMatcher.instances == [
         {
             "method": "S2",
             "max_disparity": 64,
@@ -172,8 +173,8 @@ def test_match_writes_everything_else(tmp_path, pair):
     options = [word for name, file in names.items() for word in (f"--{name}", tmp_path / file)]
     result = run("match", *pair, "-o", tmp_path / "d.png", *options, "--calibration", tmp_path / "calibration.json")
     assert result.exit_code == 0, result.output
-    assert FakeMatcher.made[0]["right"] is True
-    assert FakeMatcher.made[0]["confidence"] is True
+    assert FakeMatcher.instances[0]["right"] is True
+    assert FakeMatcher.instances[0]["confidence"] is True
     color = io.read_image(tmp_path / "c.png")
     assert color.shape == (HEIGHT, WIDTH, 3)
     assert (color[:, 0] == 0).all()
@@ -183,7 +184,7 @@ def test_match_writes_everything_else(tmp_path, pair):
     cloud = (tmp_path / "p.ply").read_bytes()
     assert b"element vertex 42\n" in cloud  # 6 * 7 pixels of finite depth
     vertices = np.frombuffer(cloud.split(b"end_header\n", 1)[1], np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
-    np.testing.assert_allclose(vertices["xyz"][0], [0.01, 0, 1])  # pixel (1, 0) at 100 * 0.1 / 10 metres
+    np.testing.assert_allclose(vertices["xyz"][0], [0.01, 0, -1])  # y up; pixel (1, 0) at 100 * 0.1 / 10 metres
     assert vertices["rgb"][0].tolist() == [3, 4, 5]
     report = json.loads((tmp_path / "j.json").read_text())
     assert (report["width"], report["height"], report["density"]) == (WIDTH, HEIGHT, 0.875)
@@ -233,7 +234,7 @@ def test_json_to_the_terminal(tmp_path, pair):
         (["-o", "{}/d.png", "--right", "{}/nowhere/r.png"], "--right"),
         (["-o", "{}/d.png", "--confidence", "{}/k.pfm"], "--confidence must end in"),
         (["-o", "{}/d.png", "--ply", "{}/p.obj"], "--ply must end in"),
-        (["-o", "{}/d.png", "--ply", "{}/p.ply"], "--ply and --calibration go together"),
+        (["-o", "{}/d.png", "--ply", "{}/p.ply"], "--ply and --depth go together with --calibration"),
         (["-o", "{}/d.png", "--calibration", "{}/calibration.json"], "go together"),
         (["-o", "{}/d.png", "--ply", "{}/p.ply", "--calibration", "{}/left.png"], "not a text file"),
         (["-o", "{}/d.png", "--ply", "{}/p.ply", "--calibration", "{}/large.json"], "9x6 pixels"),

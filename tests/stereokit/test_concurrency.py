@@ -204,7 +204,7 @@ def test_a_steady_stream_of_frames_allocates_nothing_but_the_maps_it_returns(met
     matcher = Matcher(method, max_disparity=32, threads=threads)
     for _ in range(2):
         matcher(*pair)
-    held = [matcher(*pair) for _ in range(2)]
+    results = [matcher(*pair) for _ in range(2)]
     tracemalloc.start()
     try:
         for _ in range(4):
@@ -214,20 +214,20 @@ def test_a_steady_stream_of_frames_allocates_nothing_but_the_maps_it_returns(met
             _, peak = tracemalloc.get_traced_memory()
             returned = result.disparity.nbytes + result.valid.nbytes
             assert peak - before - returned < 32_000  # objects of python: no map, and less than two rows of levels
-            held.append(result)
+            results.append(result)
     finally:
         tracemalloc.stop()
-    for result in held[1:]:
-        np.testing.assert_array_equal(held[0].disparity, result.disparity)
+    for result in results[1:]:
+        np.testing.assert_array_equal(results[0].disparity, result.disparity)
 
 
 def test_maps_that_were_returned_are_not_buffers():
     matcher = Matcher("census+sgm", max_disparity=16, threads=2)
     first = matcher(*pair_of(10))
-    kept = first.disparity.copy(), first.valid.copy()
+    copies = first.disparity.copy(), first.valid.copy()
     matcher(*pair_of(11))
-    np.testing.assert_array_equal(first.disparity, kept[0])
-    np.testing.assert_array_equal(first.valid, kept[1])
+    np.testing.assert_array_equal(first.disparity, copies[0])
+    np.testing.assert_array_equal(first.valid, copies[1])
 
 
 def test_stages_run_one_after_another_and_fail_together():

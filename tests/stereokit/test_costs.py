@@ -267,12 +267,12 @@ def test_a_row_cost_sees_8_bits_whatever_comes_in(random_pair, dtype, smooth):
         out[:] = 0
 
     left, right = (np.sort(image, axis=1) for image in random_pair(6, 40, seed=21))
-    given = [image.astype(dtype) for image in (left, right)]
+    images = [image.astype(dtype) for image in (left, right)]
     if dtype == np.uint16:
-        given = [image * dtype(100) + dtype(5000) for image in given]
+        images = [image * dtype(100) + dtype(5000) for image in images]
     if dtype == np.float32:
-        given = [image / dtype(255) for image in given]
-    cost_volume(*given, RowCost(spy, 60), smooth=smooth, max_disparity=4)
+        images = [image / dtype(255) for image in images]
+    cost_volume(*images, RowCost(spy, 60), smooth=smooth, max_disparity=4)
     low, high = (
         (0, 255) if dtype == np.uint8 else (float(min(left.min(), right.min())), float(max(left.max(), right.max())))
     )

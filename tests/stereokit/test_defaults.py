@@ -66,8 +66,8 @@ def test_defaults_of_a_method_are_the_common_ones_its_own_and_those_of_the_size(
 
 def test_defaults_that_are_given_out_are_copies():
     for method, half in (("census+sgm", True), ("census+sgm", False), ("other+sgm", True)):
-        given = defaults_of(method, half=half)
-        given["smooth"] = 99
+        defaults = defaults_of(method, half=half)
+        defaults["smooth"] = 99
         assert defaults_of(method, half=half)["smooth"] != 99
 
 
@@ -85,10 +85,10 @@ def test_a_matcher_takes_the_defaults_of_its_size(method, option):
 @pytest.mark.parametrize(("method", "option"), CASES)
 def test_what_is_said_wins_over_the_default_of_half_size(method, option):
     full = at_full_size(method, option)
-    said = Matcher(method, scale=0.5, **{option: full})
-    assert used(said, option) == full
+    matcher = Matcher(method, scale=0.5, **{option: full})
+    assert used(matcher, option) == full
     for other in HALF[method].keys() - {option}:
-        assert used(said, other) == HALF[method][other]
+        assert used(matcher, other) == HALF[method][other]
 
 
 @pytest.mark.parametrize("method", NAMES)
@@ -98,10 +98,10 @@ def test_half_size_is_the_half_size_pair_with_these_options(random_pair, method)
     Matcher(method, max_disparity=24, scale=0.5, refiner=keeping)(left, right)
     pair = half_size(gray_pair(left, right))
     full_options = {name: at_full_size(method, name) for name in HALF[method]}
-    found = {}
+    maps = {}
     for name, options in (("half", HALF[method]), ("full", full_options)):
-        found[name] = Matcher(method, max_disparity=12, **options)(pair.left, pair.right).disparity
-    np.testing.assert_array_equal(keeping.coarse.disparity, found["half"])
-    assert (found["half"] != found["full"]).any()
+        maps[name] = Matcher(method, max_disparity=12, **options)(pair.left, pair.right).disparity
+    np.testing.assert_array_equal(keeping.coarse.disparity, maps["half"])
+    assert (maps["half"] != maps["full"]).any()
     plain = Matcher(method, max_disparity=12)(pair.left, pair.right)  # scale 1 knows nothing of half size
-    np.testing.assert_array_equal(plain.disparity, found["full"])
+    np.testing.assert_array_equal(plain.disparity, maps["full"])

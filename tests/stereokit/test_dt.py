@@ -155,9 +155,9 @@ def test_rf_of_extreme_costs_never_overflows(passes, largest):
 def test_volumes_do_not_depend_on_threads_and_are_not_modified(mode):
     volume, guide = costs_of((19, 23), 9), guide_of((19, 23))
     for source in (volume, volume.astype(np.float32)):
-        kept = source.copy()
+        before = source.copy()
         one = aggregate(source, guide, "dt", cost="census", mode=mode, threads=1)
-        np.testing.assert_array_equal(source, kept)
+        np.testing.assert_array_equal(source, before)
         for threads in (2, 3, 40):
             many = aggregate(source, guide, "dt", cost="census", mode=mode, threads=threads)
             np.testing.assert_array_equal(one, many)

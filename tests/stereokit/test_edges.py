@@ -114,9 +114,9 @@ def test_lists_and_other_numbers_are_maps_too():
     assert fill(rows).tolist() == [[2, 2, 3], [4, 5, 6]]
     assert median(rows).tolist()[1] == [4, 4, 5]
     for dtype in (np.float64, ">f4", np.int16, np.float16):
-        given = np.array([[1, 2], [3, 4]], dtype)
-        assert fill(given).tolist() == [[1, 2], [3, 4]]
-        assert single_matching_phase(np.zeros((2, 2)), given).tolist() == [[0, 0], [0, 0]]
+        values = np.array([[1, 2], [3, 4]], dtype)
+        assert fill(values).tolist() == [[1, 2], [3, 4]]
+        assert single_matching_phase(np.zeros((2, 2)), values).tolist() == [[0, 0], [0, 0]]
     assert np.isnan(remove_speckles(MAP, 2**70)).all()
     assert (remove_speckles(MAP, 11) == 1).all()
 
@@ -165,8 +165,8 @@ def test_at_half_size_nothing_lies_below_the_minimum(low, random_pair):
     options = {"scale": 0.5, "min_disparity": low, "max_disparity": low + 32}
     assert low < 0 or (stereokit.match(blank, blank, "S1", **options) == low).all()
     left, _ = random_pair(40, 80)
-    found = Matcher("S1", right=True, **options)(left, np.roll(left, -low, axis=1))
-    for disparity in (found.disparity, found.right):
+    result = Matcher("S1", right=True, **options)(left, np.roll(left, -low, axis=1))
+    for disparity in (result.disparity, result.right):
         assert low <= disparity.min() and disparity.max() < low + 32
 
 
@@ -174,8 +174,8 @@ def test_an_odd_minimum_at_half_size_is_found():
     """Half a pixel below the first whole level lies what is searched for: it is as near as at any other offset."""
     left = np.random.default_rng(0).integers(0, 256, (60, 160), dtype=np.uint8).repeat(2, 0).repeat(2, 1)
     right = np.roll(left, -5, axis=1)
-    found = stereokit.match(left, right, "S2", scale=0.5, min_disparity=5, max_disparity=37)
-    assert np.median(np.abs(found[20:-20, 60:-60] - 5)) <= 0.5
+    disparity = stereokit.match(left, right, "S2", scale=0.5, min_disparity=5, max_disparity=37)
+    assert np.median(np.abs(disparity[20:-20, 60:-60] - 5)) <= 0.5
 
 
 def test_errors_are_one_family():

@@ -88,7 +88,7 @@ def with_size(suffix):
     """Return a good image of 64 x 96 and the function that gives it another size, all else as it was."""
     grey = np.zeros((64, 96), np.uint8)
     data = cv2.imencode(suffix, grey if suffix in (".jpg", ".bmp") else np.dstack([grey] * 3))[1].tobytes()
-    at, layout = {
+    offset, layout = {
         ".png": (16, ">II"),
         ".gif": (6, "<HH"),
         ".bmp": (18, "<ii"),
@@ -98,7 +98,7 @@ def with_size(suffix):
     def claiming(width, height):
         size = (height, width) if suffix == ".jpg" else (width, height)
         changed = bytearray(data)
-        struct.pack_into(layout, changed, at, *size)
+        struct.pack_into(layout, changed, offset, *size)
         if suffix == ".png":
             changed[12:33] = chunk(b"IHDR", changed[16:29])[4:]
         return bytes(changed)
@@ -123,9 +123,9 @@ def test_a_small_file_that_claims_a_huge_image_never_reaches_the_decoder(suffix,
 def test_a_chunk_that_claims_more_than_the_file_never_reaches_the_decoder(tmp_path, monkeypatch):
     path = tmp_path / "image.png"
     content = cv2.imencode(".png", IMAGE)[1].tobytes()
-    at = content.index(b"IDAT")
+    offset = content.index(b"IDAT")
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
-    path.write_bytes(content[: at - 4] + struct.pack(">I", 0x7FFFFFE3) + content[at:])
+    path.write_bytes(content[: offset - 4] + struct.pack(">I", 0x7FFFFFE3) + content[offset:])
     with pytest.raises(FileError, match=rf"a part of it claims more than its {len(content)} bytes"):
         io.read_image(path)
 
@@ -157,8 +157,8 @@ def test_blank_images_are_within_what_their_bytes_can_hold(suffix, tmp_path):
 def test_a_tiff_without_a_width_or_a_height_is_one_line(missing, tmp_path):
     pytest.importorskip("tifffile")
     content = bytearray(cv2.imencode(".tiff", IMAGE)[1].tobytes())
-    at = struct.unpack_from("<I", content, 4)[0] + 2
-    for place in range(at, at + 12 * struct.unpack_from("<H", content, at - 2)[0], 12):
+    offset = struct.unpack_from("<I", content, 4)[0] + 2
+    for place in range(offset, offset + 12 * struct.unpack_from("<H", content, offset - 2)[0], 12):
         if struct.unpack_from("<H", content, place)[0] == missing:
             struct.pack_into("<I", content, place + 8, 0)
     path = tmp_path / "image.tif"
@@ -250,9 +250,9 @@ def test_a_file_is_read_alike_with_and_without_a_bound_of_memory(tmp_path):
         source = open_source("left", tmp_path / name)
         assert source.shape == whole.shape and source.dtype == whole.dtype, name
         np.testing.assert_array_equal(source.read(5, 20, 7, 33), whole[5:20, 7:33], err_msg=name)
-        wanted = COLOR if name in ("color.npy", "tiled.tif", "planar.tif") else IMAGE
-        wanted = np.repeat(IMAGE[:, :, None], 3, axis=2) if name == "palette.tif" else wanted
-        np.testing.assert_array_equal(whole, wanted, err_msg=name)
+        expected = COLOR if name in ("color.npy", "tiled.tif", "planar.tif") else IMAGE
+        expected = np.repeat(IMAGE[:, :, None], 3, axis=2) if name == "palette.tif" else expected
+        np.testing.assert_array_equal(whole, expected, err_msg=name)
 
 
 def test_a_rare_tiff_says_what_to_install(tmp_path, monkeypatch):
@@ -317,7 +317,7 @@ def test_others_may_write_while_a_decoder_is_silenced(capfd, nobody_else):
     with quiet.quiet_decoders(), quiet.quiet_decoders():
         os.write(2, b"not heard\n")
     assert capfd.readouterr().err == "heard\n"
-    assert cv2.utils.logging.getLogLevel() != cv2.utils.logging.LOG_LEVEL_SILENT
+    assert quiet._log.getLogLevel() != quiet._SILENT
 
 
 def test_the_command_line_says_one_line_for_each_broken_file(tmp_path, run_python):

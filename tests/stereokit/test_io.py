@@ -191,9 +191,9 @@ def test_float_formats_round_trip(tmp_path, suffix, shape):
     disparity = np.random.default_rng(0).normal(0, 100, (2 * shape[0], 3 * shape[1])).astype(np.float32)
     disparity = disparity[::2, ::3]  # strided
     disparity[0, 0] = NAN
-    kept = disparity.copy()
+    original = disparity.copy()
     io.write_disparity(tmp_path / f"d{suffix}", disparity)
-    np.testing.assert_array_equal(disparity, kept)
+    np.testing.assert_array_equal(disparity, original)
     back = io.read_disparity(tmp_path / f"d{suffix}")
     assert back.dtype == np.float32
     np.testing.assert_array_equal(back, disparity)

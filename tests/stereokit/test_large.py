@@ -128,11 +128,11 @@ def test_windows_decide_what_whole_images_decide(kind, tmp_path, cut):
 def test_options_of_the_finish_are_those_of_match(options, tmp_path, cut):
     left, right = textured(280, 160)
     left[100:190, 20:150] = 90  # a gap wider than a window's margin
-    given = {"max_disparity": 16, **options}
+    matcher_options = {"max_disparity": 16, **options}
     cut(220 * 160)
-    result = stereokit.match_large(left, right, tmp_path / "out.npy", "S1", overlap=80, **given)
+    result = stereokit.match_large(left, right, tmp_path / "out.npy", "S1", overlap=80, **matcher_options)
     assert result.windows > 1
-    expected = stereokit.Matcher("S1", **given)(left, right)
+    expected = stereokit.Matcher("S1", **matcher_options)(left, right)
     np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), expected.disparity)
     assert result.density == pytest.approx(expected.density)
 
@@ -151,16 +151,16 @@ def test_seams_fade_with_the_overlap(method, tmp_path, cut):
     from stereokit_evaluation.synthetic.scenes import generate
 
     scene = generate(3, 400, 704, 64)
-    found = {}
+    differences = {}
     for overlap in (0, 32, 96):
         cut(400 * (352 + overlap))  # two strips
         differ, far, result = seam_error(tmp_path, scene.left, scene.right, method, overlap, max_disparity=64)
         assert result.windows == 2 and result.window == (352 + overlap, 400)
-        found[overlap] = 704 * differ, 704 * far  # pixels for each column of the cut
-    assert found[0] > found[32] >= found[96]
-    assert found[96][0] < 2 and found[96][1] < 0.1
+        differences[overlap] = 704 * differ, 704 * far  # pixels for each column of the cut
+    assert differences[0] > differences[32] >= differences[96]
+    assert differences[96][0] < 2 and differences[96][1] < 0.1
     if method in ("S1", "S3"):
-        assert found[96][0] == 0
+        assert differences[96][0] == 0
 
 
 def test_columns_are_cut_where_a_strip_is_too_wide(tmp_path, cut):
@@ -187,12 +187,12 @@ def test_half_size_keeps_its_phase(tmp_path, cut):
 )  # fmt: skip
 def test_the_cut_a_plan_cover_each_pixel_once(height, width, reach_y, reach_x, budget):
     try:
-        found = plan(height, width, reach_y, reach_x, budget, lambda h, w: h * w)
+        windows = plan(height, width, reach_y, reach_x, budget, lambda h, w: h * w)
     except OptionError:
         assert min(height, 2 * reach_y + STEP) * min(width, 2 * reach_x + STEP) > budget * 0.5
         return
-    assert found.window[0] * found.window[1] <= budget
-    for cuts, length, reach in ((found.rows, height, reach_y), (found.columns, width, reach_x)):
+    assert windows.window[0] * windows.window[1] <= budget
+    for cuts, length, reach in ((windows.rows, height, reach_y), (windows.columns, width, reach_x)):
         assert [cut.first for cut in cuts] == [0, *(cut.last for cut in cuts[:-1])]
         assert cuts[-1].last == length and len({cut.stop - cut.start for cut in cuts}) == 1
         for cut in cuts:
@@ -202,17 +202,17 @@ def test_the_cut_a_plan_cover_each_pixel_once(height, width, reach_y, reach_x, b
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("amount", "expected"),
     [("2GB", 2 * 10**9), ("1.5 GiB", 3 * 2**29), ("800m", 8 * 10**8), ("64k", 64_000), (12345, 12345), ("7", 7)],
 )
-def test_memory_is_read_with_its_unit(given, expected):
-    assert memory.parse_memory(given) == expected
+def test_memory_is_read_with_its_unit(amount, expected):
+    assert memory.parse_memory(amount) == expected
 
 
-@pytest.mark.parametrize("given", ["", "two", "-1GB", "1XB", 0, -5, True, float("nan"), float("inf"), None, []])
-def test_other_memory_is_refused(given):
+@pytest.mark.parametrize("amount", ["", "two", "-1GB", "1XB", 0, -5, True, float("nan"), float("inf"), None, []])
+def test_other_memory_is_refused(amount):
     with pytest.raises(OptionError, match="memory must be"):
-        memory.parse_memory(given)
+        memory.parse_memory(amount)
 
 
 # Files

@@ -48,15 +48,15 @@ def test_black_wedges_are_what_masks_are(method, share):
     pair = blackened(LEFT, left), blackened(RIGHT, right)
     for options in ({}, {"fill": None}, {"min_disparity": -9}, {"scale": 0.5}, {"confidence": True}):
         matcher = Matcher(method, **OPTIONS, **options)
-        found = quietly(matcher, *pair)
+        result = quietly(matcher, *pair)
         masked = quietly(matcher, LEFT, RIGHT, mask=left, right_mask=right)
-        np.testing.assert_array_equal(found.disparity, masked.disparity)
-        assert not found.valid[~left].any() and np.isnan(found.disparity[~left]).all()
-        assert np.isfinite(found.disparity[left]).all() or options == {"fill": None}
+        np.testing.assert_array_equal(result.disparity, masked.disparity)
+        assert not result.valid[~left].any() and np.isnan(result.disparity[~left]).all()
+        assert np.isfinite(result.disparity[left]).all() or options == {"fill": None}
         inner = left & (X > 40) & (X < WIDTH - 40)
-        assert np.median(np.abs(found.disparity[inner & found.valid] - DISPARITY)) < 0.5
+        assert np.median(np.abs(result.disparity[inner & result.valid] - DISPARITY)) < 0.5
         if options == {"confidence": True}:
-            assert not found.confidence[~left].any()
+            assert not result.confidence[~left].any()
 
 
 @pytest.mark.parametrize("method", ["S2", "S4"])
@@ -75,27 +75,27 @@ def test_what_is_masked_does_not_matter(method):
 
 def test_half_and_all_masked():
     matcher = Matcher("S2", **OPTIONS)
-    found = quietly(matcher, LEFT, RIGHT, mask=X >= WIDTH // 2)
-    assert not found.valid[:, : WIDTH // 2].any() and np.isnan(found.disparity[:, : WIDTH // 2]).all()
-    assert found.valid[:, WIDTH // 2 + 20 :].mean() > 0.9
+    result = quietly(matcher, LEFT, RIGHT, mask=X >= WIDTH // 2)
+    assert not result.valid[:, : WIDTH // 2].any() and np.isnan(result.disparity[:, : WIDTH // 2]).all()
+    assert result.valid[:, WIDTH // 2 + 20 :].mean() > 0.9
     np.testing.assert_array_equal(
         matcher(LEFT, RIGHT, mask=np.ones(LEFT.shape, bool)).disparity, matcher(LEFT, RIGHT).disparity
     )
     nothing = np.zeros(LEFT.shape, bool)
     for method, options in (("S1", {}), ("S2", {"scale": 0.5}), ("S3", {"fill": None}), ("S4", {"right": True})):
         with pytest.warns(stereokit.PairWarning, match="no pixel is usable"):
-            found = Matcher(method, **OPTIONS, **options)(LEFT, RIGHT, mask=nothing, right_mask=nothing)
-        assert not found.valid.any() and np.isnan(found.disparity).all()
-        assert found.right is None or np.isnan(found.right).all()
+            result = Matcher(method, **OPTIONS, **options)(LEFT, RIGHT, mask=nothing, right_mask=nothing)
+        assert not result.valid.any() and np.isnan(result.disparity).all()
+        assert result.right is None or np.isnan(result.right).all()
     with collecting() as lines:
-        found = Matcher("S2", **OPTIONS)(LEFT.astype(np.float32), RIGHT.astype(np.float32), mask=nothing)
-    assert np.isnan(found.disparity).all() and lines
+        result = Matcher("S2", **OPTIONS)(LEFT.astype(np.float32), RIGHT.astype(np.float32), mask=nothing)
+    assert np.isnan(result.disparity).all() and lines
 
 
 def test_the_right_view_s_map_has_the_right_mask():
-    found = quietly(Matcher("S2", right=True, **OPTIONS), LEFT, RIGHT, right_mask=X < 100)
-    assert np.isnan(found.right[:, 100:]).all() and np.isfinite(found.right[:, :100]).all()
-    assert np.isfinite(found.disparity).all()
+    result = quietly(Matcher("S2", right=True, **OPTIONS), LEFT, RIGHT, right_mask=X < 100)
+    assert np.isnan(result.right[:, 100:]).all() and np.isfinite(result.right[:, :100]).all()
+    assert np.isfinite(result.disparity).all()
 
 
 @pytest.mark.parametrize(
@@ -126,8 +126,8 @@ def test_match_and_map_take_masks():
     with collecting():
         one = stereokit.match(LEFT, RIGHT, "S2", mask=left, right_mask=right, **OPTIONS)
         many = list(matcher.map([(LEFT, RIGHT)] * 3, mask=left, right_mask=right))
-    for found in (one, *(result.disparity for result in many)):
-        np.testing.assert_array_equal(found, expected)
+    for result in (one, *(result.disparity for result in many)):
+        np.testing.assert_array_equal(result, expected)
 
 
 @pytest.mark.parametrize("method", ["S2", "S4"])
@@ -158,9 +158,9 @@ def test_transparent_pixels_are_masked(tmp_path):
         assert cv2.imwrite(str(tmp_path / f"{name}.png"), rgba)
     pair = read_pair(tmp_path / "left.png", tmp_path / "right.png", alpha=True)
     assert pair[0].shape == (HEIGHT, WIDTH, 4) and read_image(tmp_path / "left.png").shape == (HEIGHT, WIDTH, 3)
-    found = quietly(Matcher("S2", **OPTIONS), *pair).disparity
+    result = quietly(Matcher("S2", **OPTIONS), *pair).disparity
     expected = quietly(Matcher("S2", **OPTIONS), LEFT, RIGHT, mask=left, right_mask=right).disparity
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(result, expected)
     with collecting():
         stereokit.match_large(tmp_path / "left.png", tmp_path / "right.png", tmp_path / "map.npy", "S2", **OPTIONS)
     np.testing.assert_array_equal(np.load(tmp_path / "map.npy"), expected)
@@ -176,16 +176,16 @@ def test_what_has_no_texture_is_not_measured_but_filled(method):
     left[15:45, 70:110] = 180
     right[15:45, 70 - DISPARITY : 110 - DISPARITY] = 180
     reach = Matcher(method, **OPTIONS).settings.reach
-    found = Matcher(method, **OPTIONS)(left, right)
+    result = Matcher(method, **OPTIONS)(left, right)
     inside = np.zeros(left.shape, bool)
     inside[15 + reach[1] : 45 - reach[1], 70 + reach[0] : 110 - reach[0]] = True
-    assert inside.any() and not found.valid[inside].any()
-    assert np.isfinite(found.disparity).all() and np.abs(found.disparity[inside] - DISPARITY).max() < 1.5
-    np.testing.assert_array_equal(np.isnan(found.measured), ~found.valid)
-    np.testing.assert_array_equal(found.measured[found.valid], found.disparity[found.valid])
+    assert inside.any() and not result.valid[inside].any()
+    assert np.isfinite(result.disparity).all() and np.abs(result.disparity[inside] - DISPARITY).max() < 1.5
+    np.testing.assert_array_equal(np.isnan(result.measured), ~result.valid)
+    np.testing.assert_array_equal(result.measured[result.valid], result.disparity[result.valid])
     bare = Matcher(method, fill=None, **OPTIONS)(left, right)
     np.testing.assert_array_equal(np.isfinite(bare.disparity), bare.valid)
-    np.testing.assert_array_equal(bare.valid, found.valid)
+    np.testing.assert_array_equal(bare.valid, result.valid)
 
 
 def test_a_letterbox_of_grey_is_not_measured_at_the_nearest_disparity():
@@ -193,8 +193,8 @@ def test_a_letterbox_of_grey_is_not_measured_at_the_nearest_disparity():
     for view in (left, right):
         view[:, :30] = 90
     for method in ("S2", "S4"):
-        found = quietly(Matcher(method, **OPTIONS), left, right)
-        assert not found.valid[:, :24].any()
+        result = quietly(Matcher(method, **OPTIONS), left, right)
+        assert not result.valid[:, :24].any()
 
 
 def plain_blank(gray, across, down):
@@ -217,9 +217,9 @@ def test_blank_pixels_are_those_with_equal_surroundings(kind):
             y, x = rng.integers(0, height), rng.integers(0, width)
             gray[y : y + rng.integers(1, 16), x : x + rng.integers(1, 16)] = rng.integers(0, 2)
         across, down = (int(side) for side in rng.integers(0, 6, 2))
-        found = blank_pixels(gray, across, down)
+        result = blank_pixels(gray, across, down)
         expected = plain_blank(gray, across, down)
-        np.testing.assert_array_equal(np.zeros(gray.shape, bool) if found is None else found, expected)
+        np.testing.assert_array_equal(np.zeros(gray.shape, bool) if result is None else result, expected)
 
 
 def test_black_borders_are_thick_connected_and_at_a_side():
@@ -246,5 +246,5 @@ def test_maps_without_any_such_pixel_are_as_dense_as_before():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for options in ({}, {"scale": 0.5}, {"min_disparity": -3}):
-            found = Matcher("S4", **OPTIONS, **options)(LEFT, RIGHT)
-            assert np.isfinite(found.disparity).all() and found.density > 0.75
+            result = Matcher("S4", **OPTIONS, **options)(LEFT, RIGHT)
+            assert np.isfinite(result.disparity).all() and result.density > 0.75

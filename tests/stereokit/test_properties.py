@@ -121,16 +121,16 @@ def test_maps_are_dense_in_range_and_confidence_is_a_share(seed, method, scale, 
 @given(seed=SEEDS, height=st.integers(1, 6), width=st.integers(1, 24), gaps=st.sampled_from([0, 0.2, 0.7, 1]))
 def test_post_processing_of_any_map(seed, height, width, gaps):
     disparity, cost = maps(seed, height, width, gaps)
-    kept = single_matching_phase(disparity, cost)
-    np.testing.assert_array_equal(kept, oracles.single_matching_phase(disparity, cost))
-    np.testing.assert_array_equal(single_matching_phase(kept, cost), kept)
+    consistent = single_matching_phase(disparity, cost)
+    np.testing.assert_array_equal(consistent, oracles.single_matching_phase(disparity, cost))
+    np.testing.assert_array_equal(single_matching_phase(consistent, cost), consistent)
     for mode in ("background", "nearest"):
-        filled = fill(kept, mode)
-        np.testing.assert_array_equal(filled, oracles.fill(kept, mode))
-        np.testing.assert_array_equal(filled[~np.isnan(kept)], kept[~np.isnan(kept)])
-    np.testing.assert_array_equal(remove_speckles(kept, 2), oracles.remove_speckles(kept, 2))
+        filled = fill(consistent, mode)
+        np.testing.assert_array_equal(filled, oracles.fill(consistent, mode))
+        np.testing.assert_array_equal(filled[~np.isnan(consistent)], consistent[~np.isnan(consistent)])
+    np.testing.assert_array_equal(remove_speckles(consistent, 2), oracles.remove_speckles(consistent, 2))
     for size in (3, 5):
-        np.testing.assert_array_equal(median(kept, size), oracles.median(kept, size))
+        np.testing.assert_array_equal(median(consistent, size), oracles.median(consistent, size))
 
 
 @given(

@@ -18,7 +18,7 @@ ROWS_PX, DEPTH_SHARE = 0.1, 0.01
 """What the rows of a rectified pair may differ by, and the depth of what is matched in it by."""
 
 
-def made(name, size=rigs.SIZE):
+def rig_of(name, size=rigs.SIZE):
     truth = rigs.rig_of(name)
     model = "fisheye" if truth.fisheye else "pinhole"
     left, right = (Camera(k, d, model, *size) for k, d in zip(truth.k, truth.d, strict=True))
@@ -45,11 +45,11 @@ def positions(raw_rig, options, side):
 @pytest.mark.parametrize("name", rigs.LENSES)
 def test_a_point_lies_in_one_row_and_its_disparity_is_its_depth(name, options):
     """Follow points through the images themselves: each rectified pixel says which raw pixel it shows."""
-    truth, rig = made(name)
+    truth, rig = rig_of(name)
     points, pixels = seen_points(truth)
     assert len(points) > 500
     camera = rig.rectified(**options)
-    found = []
+    places = []
     for side in (0, 1):
         across, down = positions(rig, options, side)
         mask = (rig.rectification(**options).mask, rig.rectification(**options).right_mask)[side]
@@ -69,13 +69,13 @@ def test_a_point_lies_in_one_row_and_its_disparity_is_its_depth(name, options):
         step = np.full((len(row), 2), np.nan)
         rest = pixels[side] - np.stack([across[row, column], down[row, column]], 1)
         step[good] = np.linalg.solve(jacobian[good], rest[good][..., None])[..., 0]
-        found.append(np.stack([column + step[:, 0], row + step[:, 1]], 1))
-    both = np.isfinite(found[0]).all(1) & np.isfinite(found[1]).all(1)
+        places.append(np.stack([column + step[:, 0], row + step[:, 1]], 1))
+    both = np.isfinite(places[0]).all(1) & np.isfinite(places[1]).all(1)
     assert both.mean() > 0.3
-    rows_apart = np.abs(found[0][both, 1] - found[1][both, 1])
+    rows_apart = np.abs(places[0][both, 1] - places[1][both, 1])
     assert rows_apart.max() < ROWS_PX
     depth = (points[both] @ rig.rectification(**options).turns[0].T)[:, 2]
-    disparity = found[0][both, 0] - found[1][both, 0]
+    disparity = places[0][both, 0] - places[1][both, 0]
     expected = camera.fx * camera.baseline_m / depth - camera.doffs
     assert np.abs(disparity - expected).max() < ROWS_PX
     assert camera.baseline_m == pytest.approx(np.linalg.norm(truth.t), rel=1e-6)
@@ -83,7 +83,7 @@ def test_a_point_lies_in_one_row_and_its_disparity_is_its_depth(name, options):
 
 @pytest.mark.parametrize("name", ["pinhole 5", "pinhole 14", "fisheye"])
 def test_depth_of_a_known_scene(name):
-    truth, rig = made(name)
+    truth, rig = rig_of(name)
     left, right = rig.rectify(*rigs.raw_pair(truth))
     camera, made_by = rig.rectified(), rig.rectification()
     result = Matcher("S2", max_disparity=64)(left, right)
@@ -101,7 +101,7 @@ def test_depth_of_a_known_scene(name):
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32, np.float64])
 @pytest.mark.parametrize("channels", [(), (3,)])
 def test_types_and_channels_stay(kind, channels):
-    _, rig = made("pinhole 5")
+    _, rig = rig_of("pinhole 5")
     image = np.random.default_rng(0).integers(0, 200, (rigs.SIZE[1], rigs.SIZE[0], *channels)).astype(kind)
     before = image.copy()
     left, right = rig.rectify(image, image[::1], size=(200, 160))
@@ -112,7 +112,7 @@ def test_types_and_channels_stay(kind, channels):
 
 
 def test_the_mask_is_where_the_sensors_saw_something():
-    _, rig = made("pinhole 5")
+    _, rig = rig_of("pinhole 5")
     white = np.full(rigs.SIZE[::-1], 255, np.uint8)
     for options in ({"alpha": 1.0}, {"alpha": 0.3, "size": (300, 260)}, {}):
         left, right = rig.rectify(white, white, **options)
@@ -126,7 +126,7 @@ def test_the_mask_is_where_the_sensors_saw_something():
 
 @pytest.mark.parametrize("name", rigs.LENSES)
 def test_alpha_0_is_full_and_crop_takes_the_blank_away(name):
-    _, rig = made(name)
+    _, rig = rig_of(name)
     assert rig.rectification(alpha=0.0).mask.mean() > 0.98
     whole, cropped = (rig.rectification(alpha=1.0, crop=crop) for crop in (False, True))
     assert cropped.mask.mean() > 0.97 > whole.mask.mean()
@@ -172,7 +172,7 @@ def test_a_very_wide_fisheye_needs_a_focal_length():
 
 
 def test_maps_are_made_once(monkeypatch):
-    _, rig = made("pinhole 5")
+    _, rig = rig_of("pinhole 5")
     calls = []
     real = cv2.initUndistortRectifyMap
     monkeypatch.setattr(cv2, "initUndistortRectifyMap", lambda *a: calls.append(1) or real(*a))
@@ -191,7 +191,7 @@ def test_maps_are_made_once(monkeypatch):
 
 
 def test_half_size_images_with_a_rig_of_half_size():
-    truth, rig = made("pinhole 5")
+    truth, rig = rig_of("pinhole 5")
     left, right = rigs.raw_pair(truth)
     half = rig.scaled(0.5)
     assert half.size == (160, 120) and half.baseline_m == rig.baseline_m
@@ -214,11 +214,11 @@ def test_half_size_images_with_a_rig_of_half_size():
 )  # fmt: skip
 def test_options_are_checked(options, words):
     with pytest.raises(OptionError, match=words):
-        made("pinhole 5")[1].rectification(**options)
+        rig_of("pinhole 5")[1].rectification(**options)
 
 
 def test_images_are_checked():
-    _, rig = made("pinhole 5")
+    _, rig = rig_of("pinhole 5")
     good = np.zeros(rigs.SIZE[::-1], np.uint8)
     with pytest.raises(InputError, match=r"raw images of 320x240 pixels, got left of 160x120; use StereoRig.scaled"):
         rig.rectify(good[::2, ::2], good)
@@ -239,6 +239,9 @@ def test_lenses_that_do_not_go_together():
     for wrong, words in (({"width": 3}, "go together"), ({"model": "ds"}, "model must be 'pinhole' or 'fisheye'")):
         with pytest.raises(OptionError, match=words):
             Camera(rigs.K1, **wrong)
-    nonsense = Camera(rigs.K1, (50.0, 0, 0, 0), "pinhole", *size)
-    with pytest.raises(OptionError, match="choose focal|hardly a pixel|cannot be rectified|too wide"):
-        StereoRig(nonsense, nonsense, np.eye(3), (-0.1, 0, 0)).rectification()
+    wide = Camera([[60.0, 0, 160], [0, 60, 120], [0, 0, 1]], np.zeros(4), "fisheye", *size)  # 300 degrees across
+    with pytest.raises(OptionError, match=r"lenses are too wide, or their distortion is wrong.*choose focal"):
+        StereoRig(wide, wide, np.eye(3), (-0.1, 0, 0)).rectification()
+    folded = Camera(rigs.K1, (-500.0, 0, 0, 0), "pinhole", *size)
+    with pytest.raises(OptionError, match="hardly a pixel of it lies within the raw images"):
+        StereoRig(folded, folded, np.eye(3), (-0.1, 0, 0)).rectification()

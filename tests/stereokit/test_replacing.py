@@ -110,17 +110,17 @@ app.main()
     ) as process:
         try:
             assert process.stdout.readline() == "ready\n"
-            mine = [name for name in os.listdir(folder) if name.startswith(".stereokit-")]
-            assert len(mine) == 1
+            names = [name for name in os.listdir(folder) if name.startswith(".stereokit-")]
+            assert len(names) == 1
             atomic._clean_folders.clear()
             io.write_bytes(folder / "other.bin", b"")  # what is being written stays
-            assert mine[0] in os.listdir(folder)
+            assert names[0] in os.listdir(folder)
             process.send_signal(number)
             assert process.wait(60) == -number
         finally:
             process.kill()
     rest = {".0123456789abcdef.tmp", "map.bin", "other.bin"}
-    assert set(os.listdir(folder)) == rest | (set(mine) if number == signal.SIGKILL else set())
+    assert set(os.listdir(folder)) == rest | (set(names) if number == signal.SIGKILL else set())
     assert (folder / "map.bin").read_bytes() == b"old"
     atomic._clean_folders.clear()
     io.write_bytes(folder / "map.bin", b"new")

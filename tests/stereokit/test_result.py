@@ -50,7 +50,8 @@ def test_wrong_arrays_are_named(field, array, message):
 def test_depth_and_points_come_from_the_calibration():
     result = Disparity(MAP, VALID)
     calibration = Calibration(fx=100, fy=100, cx0=0, cy=0, baseline_m=0.1)
-    np.testing.assert_allclose(result.depth(calibration), [[1, 0.5, NAN], [0.25, 2, 10]])
+    np.testing.assert_allclose(result.depth(calibration, filled=True), [[1, 0.5, NAN], [0.25, 2, 10]])
+    np.testing.assert_array_equal(np.isfinite(result.depth(calibration)), result.valid & np.isfinite(result.disparity))
     assert result.points(calibration).shape == (2, 3, 3)
 
 
@@ -102,9 +103,9 @@ def test_bad_ranges_and_maps_are_refused():
 
 def test_inputs_stay_as_they_are():
     strided = np.tile(MAP, (2, 2))[::2, ::-1]
-    kept = strided.copy()
+    original = strided.copy()
     colorize(strided)
-    np.testing.assert_array_equal(strided, kept)
+    np.testing.assert_array_equal(strided, original)
 
 
 def test_numpy_takes_a_result_as_its_map():

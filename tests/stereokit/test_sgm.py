@@ -1,4 +1,8 @@
-"""Semi-global matching against loops written from Hirschmueller 2008: sums are exact."""
+"""Semi-global matching against loops written from Hirschmueller 2008: sums are exact.
+
+Each further block of 64 levels is compiled anew, so that more than two are compared here once only; `cpu.checks` has
+more, up to eight blocks, where kernels are interpreted.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +65,7 @@ def test_penalties_of_every_size(p1, p2):
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, (7, 40)])
-@pytest.mark.parametrize("count", [1, 5, 64, 65, 130])
+@pytest.mark.parametrize("count", [1, 5, 64, 65])
 @pytest.mark.parametrize("largest", [31, 254])
 def test_costs_that_are_recovered_are_those_that_were_computed(shape, count, largest):
     volume = volume_of(shape, count, largest, seed=3)
@@ -75,7 +79,7 @@ def test_costs_that_are_recovered_are_those_that_were_computed(shape, count, lar
 
 
 @pytest.mark.parametrize("largest", [1, 62, 127, 254])
-@pytest.mark.parametrize("count", [1, 5, 64, 130])
+@pytest.mark.parametrize("count", [1, 5, 64, 70])
 @pytest.mark.parametrize("pattern", ["random", "checks", "worst"])
 def test_extreme_costs_at_the_largest_penalty_never_overflow(largest, count, pattern):
     shape, p2 = (4, 5), 255 - largest
@@ -91,12 +95,6 @@ def test_extreme_costs_at_the_largest_penalty_never_overflow(largest, count, pat
     for p1 in {0, p2 // 2, p2}:
         expected = oracles.sgm(volume, p1, p2, oracles.DIRECTIONS[8])
         np.testing.assert_array_equal(sums(volume, largest, p1, p2), expected)
-
-
-def test_512_levels():
-    volume = volume_of((3, 4), 512, 62, seed=4)
-    expected = oracles.sgm(volume, 7, 193, oracles.DIRECTIONS[8])
-    np.testing.assert_array_equal(sums(volume, 62, 7, 193), expected)
 
 
 @pytest.mark.parametrize("paths", [4, 5, 8])

@@ -1,1 +1,1 @@
-"""Many pairs: found, matched, stored, resumed."""
+"""Batches of pairs: search, matching, storage, resumption."""

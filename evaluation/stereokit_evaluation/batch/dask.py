@@ -2,7 +2,7 @@
 
 Files are read and written by the workers, who must see them under the same paths; frames of a video are sent to
 them. Only as many pairs as keep the workers busy are with the cluster at a time. A pair whose worker died may have
-got its map before: the next worker finds it and leaves it.
+got its map before: the next worker keeps that map.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 from stereokit.errors import OptionError, StereokitError
 from stereokit_evaluation.batch.job import Job, Outcome, describe, work
-from stereokit_evaluation.batch.pairs import Pair
+from stereokit_evaluation.batch.pairs import PairFiles
 from stereokit_evaluation.batch.video import FramePair
 
 __all__ = ["connect", "on_cluster"]
@@ -24,7 +24,7 @@ __all__ = ["connect", "on_cluster"]
 _CONNECT_S = 10
 _LOOK_S = 1.0
 _PATIENCE_S = 120.0
-"""How long a cluster may be without a worker."""
+"""Longest time of a cluster without workers."""
 _LOST = "the Dask scheduler was lost; the same command goes on when it is back"
 
 
@@ -42,14 +42,14 @@ def connect(scheduler: str) -> Any:
         from distributed import Client
     except ModuleNotFoundError as error:
         raise StereokitError("engine 'dask' needs distributed: pip install 'stereokit[dask]'") from error
-    where: dict[str, Any] = {"scheduler_file" if scheduler.endswith(".json") else "address": scheduler}
+    target: dict[str, Any] = {"scheduler_file" if scheduler.endswith(".json") else "address": scheduler}
     try:
-        return Client(**where, timeout=_CONNECT_S, set_as_default=False)
+        return Client(**target, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise OptionError(f"scheduler must be one that answers, got {scheduler!r} ({describe(error)})") from error
 
 
-def on_cluster(job: Job, pairs: Iterable[Pair | FramePair], client: Any) -> Generator[Outcome, None, None]:
+def on_cluster(job: Job, pairs: Iterable[PairFiles | FramePair], client: Any) -> Generator[Outcome, None, None]:
     """Work on pairs with the workers of a cluster.
 
     Raises
@@ -62,20 +62,20 @@ def on_cluster(job: Job, pairs: Iterable[Pair | FramePair], client: Any) -> Gene
     waiting: dict[Any, str] = {}
     source = iter(pairs)
     run = uuid.uuid4().hex[:12]
-    number, slots, looked, last_seen = 0, 0, -_LOOK_S, time.monotonic()
-    more = True
+    number, slots, last_look, last_seen = 0, 0, -_LOOK_S, time.monotonic()
+    has_more = True
     try:
-        while more or waiting:
+        while has_more or waiting:
             now = time.monotonic()
-            if now - looked > _LOOK_S:
+            if now - last_look > _LOOK_S:
                 threads = _threads(client)
-                slots, looked = 2 * threads, now
+                slots, last_look = 2 * threads, now
                 last_seen = now if threads else last_seen
                 if now - last_seen > _PATIENCE_S:
                     raise StereokitError("the Dask scheduler has had no workers for two minutes; start some, and again")
-            while more and len(waiting) < slots:
+            while has_more and len(waiting) < slots:
                 pair = next(source, None)
-                more = pair is not None
+                has_more = pair is not None
                 if pair is None:
                     break
                 if pair.left is None or pair.right is None:
@@ -88,7 +88,7 @@ def on_cluster(job: Job, pairs: Iterable[Pair | FramePair], client: Any) -> Gene
                 waiting[future] = pair.name
                 number += 1
             if not waiting:
-                time.sleep(_LOOK_S / 5 if more else 0)
+                time.sleep(_LOOK_S / 5 if has_more else 0)
                 continue
             try:
                 with client.as_current():
@@ -98,7 +98,7 @@ def on_cluster(job: Job, pairs: Iterable[Pair | FramePair], client: Any) -> Gene
             except CancelledError:  # the client gives up all that it waited for when its connection ends
                 raise StereokitError(_LOST) from None
             for future in done:
-                if future.status in ("pending", "lost"):  # its worker died with the result: it is being made again
+                if future.status in ("pending", "lost"):  # its worker died with the result; another repeats it
                     continue
                 yield _result(future, waiting.pop(future))
     finally:

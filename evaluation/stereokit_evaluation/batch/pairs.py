@@ -1,25 +1,25 @@
-"""Which pairs a batch has: a folder, a list file or a video, listed by name before any image is read.
+"""The pairs of a batch: from a folder or a list file, listed by name before any image is read.
 
-A folder, the first rule that finds anything:
+A folder, by the first rule that gives any pair:
 
-1. ``--pattern LEFT RIGHT``, such as ``'*_cam0.png' '*_cam1.png'``: what the star stands for is the name.
+1. ``--pattern LEFT RIGHT``, such as ``'*_cam0.png' '*_cam1.png'``: the star stands for the name.
 2. Two folders in it, files paired by name without suffix: ``left`` and ``right``; ``image_2`` and ``image_3``,
    ``image_0`` and ``image_1``, ``colored_0`` and ``colored_1`` (KITTI); ``image_02`` and ``image_03``, ``image_00`` and
    ``image_01`` (KITTI raw), ``cam0`` and ``cam1`` (EuRoC), themselves or the folders ``data`` in them; all of them also
    below ``training``, ``testing`` or ``mav0``, in any case. Or the two folders themselves, as two inputs. Where no name
-   is in both, what says the side is taken off: ``left/a_left.png`` and ``right/a_right.png`` are ``a``.
-3. Files in it whose names differ in what says the side: ``left`` and ``right``, ``l`` and ``r``, ``cam0`` and ``cam1``,
-   in any case, at the start, at the end or between ``-``, ``_``, ``.`` and blanks, or beside digits (``left01``,
-   ``01L``).
+   is in both, the mark of the side is removed: ``left/a_left.png`` and ``right/a_right.png`` are ``a``.
+3. Files in it whose names differ in the mark of the side: ``left`` and ``right``, ``l`` and ``r``, ``cam0`` and
+   ``cam1``, in any case, at the start, at the end or between ``-``, ``_``, ``.`` and blanks, or next to digits
+   (``left01``, ``01L``).
 4. Folders in it, at any depth, that hold one pair each, or the folder itself: ``im0`` and ``im1`` (Middlebury 2014,
    ETH3D), ``im2`` and ``im6``, ``view1`` and ``view5``, ``left`` and ``right``. The folder's name is the pair's.
 
 A list, ``.csv``, ``.tsv`` or ``.txt``: ``left,right`` or ``left,right,name`` on each line, in UTF-8; without commas,
-tabs or blanks divide. Paths are relative to the list; the name is the left file's without suffix where none is given.
+tabs or blanks divide. Paths are relative to the list; the default name is the left file's without suffix.
 Further columns that are files, such as the true disparity, count for nothing; nor do empty lines, lines that begin with
 ``#`` and a first line ``left,right``.
 
-A name may be whatever the file system has. One that cannot be that of an output costs its own pair only.
+A name may be any file name. One that cannot be that of an output costs its own pair only.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from pathlib import Path
 from stereokit.errors import FileError, OptionError
 from stereokit.io import DISPARITY_SUFFIXES, IMAGE_SUFFIXES, READABLE_SUFFIXES, parsing, read_text
 
-__all__ = ["LIST_SUFFIXES", "Pair", "folder_pairs", "folders_pairs", "list_pairs"]
+__all__ = ["LIST_SUFFIXES", "PairFiles", "folder_pairs", "folders_pairs", "list_pairs"]
 
 LIST_SUFFIXES = (".csv", ".tsv", ".txt")
 _SIDE_FOLDERS = (
@@ -50,7 +50,7 @@ _SURE = (
     re.compile(r"(?P<name>.*)[-_.](?:(?P<left>left|l)|(?P<right>right|r))", re.IGNORECASE | re.DOTALL),
     re.compile(r"(?:(?P<left>left)|(?P<right>right))[-_.](?P<name>.*)", re.IGNORECASE | re.DOTALL),
 )
-"""Whole names without suffix; where one view of these is missing, that is worth telling."""
+"""Whole names without suffix; a missing view of these is an error."""
 _LIKELY = (
     re.compile(
         r"[-_. ]?(?<![a-z])(?:(?P<left>left|l|cam0(?!\d))|(?P<right>right|r|cam1(?!\d)))(?![a-z])[-_. ]?", re.IGNORECASE
@@ -62,15 +62,15 @@ _FILES = frozenset((*READABLE_SUFFIXES, *DISPARITY_SUFFIXES))
 
 
 @dataclass(frozen=True)
-class Pair:
-    """One pair: a name, which no other pair has, and two files, which may turn out not to be there.
+class PairFiles:
+    """One pair: a unique name, and two files, which may be missing.
 
     Attributes
     ----------
     name : str
     left, right : str or None
     reason : str
-        Why there is no file, where there is none.
+        The reason why there is no file, where there is none.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Pair:
     reason: str = ""
 
 
-def folder_pairs(folder: Path, pattern: tuple[str, str] | None = None) -> list[Pair]:
+def folder_pairs(folder: Path, pattern: tuple[str, str] | None = None) -> list[PairFiles]:
     """Return the pairs of a folder, sorted by name.
 
     Parameters
@@ -111,11 +111,11 @@ def folder_pairs(folder: Path, pattern: tuple[str, str] | None = None) -> list[P
     raise FileError(
         f"no pairs in {str(folder)!r}: it has neither folders left and right, image_2 and image_3 or cam0 and cam1, "
         "nor files NAME_left and NAME_right, nor folders with im0 and im1; "
-        "other names can be told with --pattern, such as --pattern '*_a.png' '*_b.png'"
+        "use --pattern for other names, such as --pattern '*_a.png' '*_b.png'"
     )
 
 
-def folders_pairs(left: Path, right: Path) -> list[Pair]:
+def folders_pairs(left: Path, right: Path) -> list[PairFiles]:
     """Return the pairs of a folder of left and a folder of right images, sorted by name; see `folder_pairs`."""
     sides = [_stems(folder) for folder in (left, right)]
     if not sides[0].keys() & sides[1].keys():
@@ -125,17 +125,17 @@ def folders_pairs(left: Path, right: Path) -> list[Pair]:
     return _joined(sides, missing, f"images in {str(left)!r} and {str(right)!r}")
 
 
-def list_pairs(path: Path) -> list[Pair]:
+def list_pairs(path: Path) -> list[PairFiles]:
     """Return the pairs of a list file, in its order.
 
     Raises
     ------
     FileError
-        If it cannot be read, a line is not what it should be, or two lines have one name.
+        If it cannot be read, a line breaks the format, or two lines have one name.
     """
     lines = read_text(path, "list").split("\n")
     base = os.path.dirname(os.path.abspath(path))
-    pairs: list[Pair] = []
+    pairs: list[PairFiles] = []
     seen: dict[str, int] = {}
     first = True
     for number, line in enumerate(lines, start=1):
@@ -162,7 +162,7 @@ def list_pairs(path: Path) -> list[Pair]:
                 f"{str(path)!r} line {number}: name {name!r} is that of line {seen[name]} too; give names of their own"
             )
         seen[name] = number
-        pairs.append(Pair(name, os.path.join(base, cells[0]), os.path.join(base, cells[1])))
+        pairs.append(PairFiles(name, os.path.join(base, cells[0]), os.path.join(base, cells[1])))
     if not pairs:
         raise FileError(f"no pairs in {str(path)!r}")
     return pairs
@@ -205,7 +205,7 @@ def _entries(folder: Path, folders: bool) -> list[str]:
 
 
 def _side_folders(folder: Path) -> Iterator[tuple[Path, Path]]:
-    """Yield the pairs of folders in a folder that are named after the sides, the surest first."""
+    """Yield the pairs of folders in a folder that are named after the sides, the most specific first."""
     top = _lowered(folder)
     for place in (top, *(_lowered(top[name]) for name in _ABOVE if name in top)):
         for names in _SIDE_FOLDERS:
@@ -216,47 +216,47 @@ def _side_folders(folder: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def _lowered(folder: Path) -> dict[str, Path]:
-    """Return the folders in a folder by their names in lower case; one that is called just that goes first."""
+    """Return the folders in a folder by their names in lower case; an exact name has priority."""
     names = _entries(folder, folders=True)
     return {name.lower(): folder / name for name in sorted(names, key=str.islower)}
 
 
-def _scenes(folder: Path) -> Iterator[Pair]:
-    """Yield the pairs of all folders at and below a folder that hold one, named after the folders."""
-    for where, folders, files in os.walk(os.path.abspath(folder)):
+def _scenes(folder: Path) -> Iterator[PairFiles]:
+    """Yield the pairs of all folders at and below a folder, one pair per folder, named after the folders."""
+    for path, folders, files in os.walk(os.path.abspath(folder)):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         stems = {os.path.splitext(file)[0].lower(): file for file in sorted(files, reverse=True) if _is_image(file)}
         for left, right in _SCENE_FILES:
             if left in stems and right in stems:
-                inside = os.path.relpath(where, folder).replace(os.sep, "/")
-                name = os.path.basename(where) if inside == "." else inside
-                yield Pair(name, os.path.join(where, stems[left]), os.path.join(where, stems[right]))
+                relative = os.path.relpath(path, folder).replace(os.sep, "/")
+                name = os.path.basename(path) if relative == "." else relative
+                yield PairFiles(name, os.path.join(path, stems[left]), os.path.join(path, stems[right]))
                 break
 
 
 def _by_side(folder: Path, files: Iterable[str], only: int | None = None) -> list[dict[str, str]]:
-    """Return the images of a folder that say in their names which side they are of, by the rest of the name.
+    """Return the images of a folder with a mark of the side in their names, by the rest of the name.
 
-    With `only`, 0 or 1, the folder holds the images of one side, and the other view is not looked for.
+    With `only`, 0 or 1, the folder has the images of one side, and the other view may be missing.
     """
-    named: list[list[tuple[str, str]]] = [[], []]
-    sure: set[str] = set()
+    files_by_side: list[list[tuple[str, str]]] = [[], []]
+    certain: set[str] = set()
     for file in filter(_is_image, files):
         stem = os.path.splitext(file)[0]
         match = next(filter(None, (pattern.fullmatch(stem) for pattern in _SURE)), None)
         if match is not None:
             name = match["name"]
-            sure.add(name)
+            certain.add(name)
         else:
-            match = next((found[-1] for p in _LIKELY if (found := list(p.finditer(stem)))), None)
+            match = next((matches[-1] for p in _LIKELY if (matches := list(p.finditer(stem)))), None)
             if match is None:
                 continue
             name = "_".join(filter(None, (stem[: match.start()], stem[match.end() :])))
         if name:
-            named[0 if match["left"] else 1].append((name, file))
-    left, right = (_named(folder, part) for part in named)
+            files_by_side[0 if match["left"] else 1].append((name, file))
+    left, right = (_named(folder, part) for part in files_by_side)
     both = left.keys() & right.keys()
-    return [{n: f for n, f in side.items() if n in both or n in sure or only is not None} for side in (left, right)]
+    return [{n: f for n, f in side.items() if n in both or n in certain or only is not None} for side in (left, right)]
 
 
 def _stems(folder: Path) -> dict[str, str]:
@@ -264,32 +264,32 @@ def _stems(folder: Path) -> dict[str, str]:
 
 
 def _named(folder: Path, files: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return files by name; of several of one name the one that is surely an image."""
-    found: dict[str, str] = {}
+    """Return files by name; of several files of one name the one with an image suffix."""
+    paths: dict[str, str] = {}
     for name, file in files:
-        if name in found:
-            other = os.path.basename(found[name])
-            sure = [f for f in (other, file) if os.path.splitext(f)[1].lower() in IMAGE_SUFFIXES]
-            if len(sure) != 1:
+        if name in paths:
+            other = os.path.basename(paths[name])
+            images = [f for f in (other, file) if os.path.splitext(f)[1].lower() in IMAGE_SUFFIXES]
+            if len(images) != 1:
                 raise FileError(f"{str(folder)!r} has two images named {name!r}: {other!r} and {file!r}")
-            file = sure[0]
-        found[name] = os.path.join(os.path.abspath(folder), file)
-    return found
+            file = images[0]
+        paths[name] = os.path.join(os.path.abspath(folder), file)
+    return paths
 
 
-def _joined(sides: Sequence[dict[str, str]], missing: tuple[str, str], what: str) -> list[Pair]:
-    """Return all names of either side; a file that is missing has the path that it should have had."""
+def _joined(sides: Sequence[dict[str, str]], missing: tuple[str, str], content: str) -> list[PairFiles]:
+    """Return the pairs of all names of either side; a missing file gets its expected path."""
     left, right = sides
     if not left and not right:
-        raise FileError(f"no {what}")
+        raise FileError(f"no {content}")
 
     def path(k: int, name: str) -> str:
         return sides[k].get(name) or missing[k].replace("*", name).replace("{}", name)
 
-    def pair(name: str) -> Pair:
+    def pair(name: str) -> PairFiles:
         if _bad_name(name):
             file = os.path.basename(left.get(name) or right[name])
-            return Pair(file, None, None, f"{file!r} gives the name {name!r}, which cannot be that of a file")
-        return Pair(name, path(0, name), path(1, name))
+            return PairFiles(file, None, None, f"{file!r} gives the name {name!r}, which cannot be that of a file")
+        return PairFiles(name, path(0, name), path(1, name))
 
     return [pair(name) for name in sorted(left.keys() | right.keys())]

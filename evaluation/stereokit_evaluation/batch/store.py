@@ -1,9 +1,9 @@
-"""The folder that a batch writes to: what it was made with, what is there already, and each output exactly once.
+"""The output folder of a batch: its manifest, its finished maps, and each output exactly once.
 
-``manifest.json`` holds the options of the run that made the folder. A later run with the same options goes on where
-that one ended; one with others is refused, so that maps of different options never lie side by side. An output is
-written to ``.partial`` and then linked to its name, which fails where the name is taken: it appears whole, and once,
-whatever dies when. One run at a time holds the folder.
+``manifest.json`` has the options of the run that created the folder. A later run with the same options resumes where
+that one ended; one with others is refused, so that a folder never mixes maps of different options. An output is
+written to ``.partial`` and then linked to its name, which fails where the name is taken: so it appears whole, and once,
+even if a process is killed at any time. One run at a time owns the folder.
 """
 
 from __future__ import annotations
@@ -22,7 +22,16 @@ from stereokit.errors import FileError, OptionError
 from stereokit.io import parsing, read_bytes, write_bytes
 from stereokit_evaluation.common.folders import check_folder, make_folder
 
-__all__ = ["COLOR", "finished", "held", "make_below", "mark_of", "publish", "target_of", "write_document"]
+__all__ = [
+    "COLOR",
+    "finished",
+    "folder_identity",
+    "make_below",
+    "open_output",
+    "publish",
+    "target_of",
+    "write_document",
+]
 
 COLOR = "color"
 """Folder of the coloured pictures."""
@@ -32,45 +41,45 @@ _PARTIAL = ".partial"
 
 
 @contextmanager
-def held(
-    folder: Path, made_with: dict[str, Any], suffix: str, owned: Callable[[str], bool], overwrite: bool
+def open_output(
+    folder: Path, identity: dict[str, Any], suffix: str, is_own: Callable[[str], bool], overwrite: bool
 ) -> Iterator[set[str]]:
-    """Hold the folder for the length of a ``with`` block, and say which names are finished.
+    """Lock the folder for a ``with`` block, and yield the names of the finished maps.
 
     Parameters
     ----------
     folder : Path
-        Made if need be.
-    made_with : dict
-        What all outputs depend on, as JSON can say it.
+        Created if missing.
+    identity : dict
+        Everything that all outputs depend on, as JSON values.
     suffix : str
         Of the maps, with its dot.
-    owned : callable
-        Says whether a name can be one of the batch's.
+    is_own : callable
+        ``is_own(name)`` is whether a name can be one of the batch's.
     overwrite : bool
-        Take the folder whatever it was made with, and first remove the maps of those names: a run that is killed
-        after that is resumed like any other.
+        Accept a folder of other options, and first remove the maps of those names: a run that is killed after that is
+        resumed like any other.
 
     Raises
     ------
     FileError
-        If the folder cannot be made or written to, or another run holds it.
+        If the folder cannot be created or written to, or another run has locked it.
     OptionError
-        If it was made with other options.
+        If it has maps of other options.
     """
     check_folder(folder)
     make_folder(folder)
     with _locked(folder):
         shutil.rmtree(folder / _PARTIAL, ignore_errors=True)  # of a run that was killed
-        made_with = json.loads(json.dumps(made_with))
-        names = set(filter(owned, finished(folder, suffix)))
+        identity = json.loads(json.dumps(identity))
+        names = set(filter(is_own, finished(folder, suffix)))
         if overwrite:
             for name in names:
                 target_of(folder, name, suffix).unlink()
             names = set()
         else:
-            _check_same(folder, _read(folder / _MANIFEST), made_with, names)
-        write_document(folder / _MANIFEST, made_with)
+            _check_same(folder, _read(folder / _MANIFEST), identity, names)
+        write_document(folder / _MANIFEST, identity)
         make_folder(folder / _PARTIAL)
         try:
             yield names
@@ -79,20 +88,20 @@ def held(
 
 
 def write_document(path: Path, content: dict[str, Any]) -> None:
-    """Write what a person may want to read: JSON with names as they are."""
+    """Write JSON for people: indented, with names in plain Unicode."""
     write_bytes(path, (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode("utf-8", "backslashreplace"))
 
 
 def finished(folder: Path, suffix: str) -> set[str]:
     """Return the names of all maps in the folder."""
-    found: set[str] = set()
-    for place, folders, files in os.walk(folder):
-        inside = os.path.relpath(place, folder).replace(os.sep, "/")
-        prefix = "" if inside == "." else inside + "/"
+    names: set[str] = set()
+    for path, folders, files in os.walk(folder):
+        relative = os.path.relpath(path, folder).replace(os.sep, "/")
+        prefix = "" if relative == "." else relative + "/"
         if not prefix:
             folders[:] = [name for name in folders if name not in (COLOR, _PARTIAL)]
-        found.update(prefix + name[: -len(suffix)] for name in files if name.endswith(suffix))
-    return found
+        names.update(prefix + name[: -len(suffix)] for name in files if name.endswith(suffix))
+    return names
 
 
 def target_of(folder: Path, name: str, suffix: str) -> Path:
@@ -110,7 +119,7 @@ def publish(folder: Path, target: Path, write: Callable[[Path], object]) -> bool
     target : Path
         Below it.
     write : callable
-        Writes the file at the path that it is given.
+        Writes the file at its argument, a path.
     """
     partial = make_below(folder, _PARTIAL)
     temporary = partial / (secrets.token_hex(8) + target.suffix)
@@ -133,12 +142,12 @@ def publish(folder: Path, target: Path, write: Callable[[Path], object]) -> bool
 
 
 def make_below(folder: Path, *parts: str) -> Path:
-    """Make folders in the batch's folder and return the last, but not that folder: it may have been removed meanwhile.
+    """Create folders in the batch's folder and return the last; the batch's folder itself is not created again.
 
     Raises
     ------
     OSError
-        If one cannot be made.
+        If one cannot be created.
     """
     for part in parts:
         folder = folder / part
@@ -146,8 +155,8 @@ def make_below(folder: Path, *parts: str) -> Path:
     return folder
 
 
-def mark_of(folder: Path) -> tuple[int, int] | None:
-    """Return what tells a folder from another that is put in its place, None if it is not there."""
+def folder_identity(folder: Path) -> tuple[int, int] | None:
+    """Return the device and inode of a folder, which differ from those of a replacement; None if it is missing."""
     try:
         state = os.stat(folder)
     except OSError:
@@ -157,23 +166,23 @@ def mark_of(folder: Path) -> tuple[int, int] | None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock the folder itself until the process ends, however it ends; where the system cannot, go on without."""
+    """Lock the folder itself for a ``with`` block or until the process ends; do nothing on a system without locks."""
     try:
         import fcntl
     except ModuleNotFoundError:  # Windows
         yield
         return
-    place = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise FileError(f"output {str(folder)!r} is being written to by another run") from error
         except OSError:  # a file system without locks
             pass
         yield
     finally:
-        os.close(place)
+        os.close(descriptor)
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -186,17 +195,17 @@ def _read(path: Path) -> dict[str, Any] | None:
         return content
 
 
-def _check_same(folder: Path, previous: dict[str, Any] | None, made_with: dict[str, Any], names: set[str]) -> None:
-    way_out = "use --overwrite or another folder"
+def _check_same(folder: Path, previous: dict[str, Any] | None, identity: dict[str, Any], names: set[str]) -> None:
+    advice = "use --overwrite or another folder"
     if previous is None:
         if names:
-            raise OptionError(f"output {str(folder)!r} holds {min(names)!r}, which no batch has made; {way_out}")
+            raise OptionError(f"output {str(folder)!r} holds {min(names)!r}, which no batch has made; {advice}")
         return
-    for key in (*made_with, *previous):
-        before, now = (content.get(key) for content in (previous, made_with))
-        if before != now:
+    for key in (*identity, *previous):
+        old, new = (content.get(key) for content in (previous, identity))
+        if old != new:
             raise OptionError(
-                f"output {str(folder)!r} was made with {key} {_short(before)}, now it is {_short(now)}; {way_out}"
+                f"output {str(folder)!r} was made with {key} {_short(old)}, now it is {_short(new)}; {advice}"
             )
 
 

@@ -1,7 +1,6 @@
 """A stereo video as pairs: left and right side by side in one file, or one file for each camera; OpenCV decodes.
 
-Frames are named by their number. They come one at a time and in order; those that are not wanted are passed over
-without being turned into pictures.
+Frames are named by their number. They come one at a time and in order; unwanted frames are skipped without decoding.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import FileError, InputError
-from stereokit.io import parsing
+from stereokit.errors import FileError, InputError, OptionError
+from stereokit.io import parsing, split_views
 from stereokit.io.quiet import quiet_decoders
 
-__all__ = ["FramePair", "Video"]
+__all__ = ["FramePair", "Frames", "Video"]
 
 Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class FramePair:
-    """One frame: its name and two images, (H, W, 3) uint8 RGB, or why there is none."""
+    """One frame: its name and two images, (H, W, 3) uint8 RGB, or the reason why there is none."""
 
     name: str
     left: Image | None
@@ -34,7 +33,27 @@ class FramePair:
     reason: str = ""
 
 
-class Video:
+class Frames:
+    """A source of pairs that come as images, one after the other.
+
+    Attributes
+    ----------
+    expected : int or None
+        How many there are, as far as the source tells; it may be wrong.
+    """
+
+    expected: int | None = None
+
+    def frames(self, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[FramePair]:
+        """Yield the frames whose names are wanted."""
+        raise NotImplementedError
+
+    def owns(self, name: str) -> bool:
+        """Return whether a frame of the source may have this name: here, a number."""
+        return name.isdigit()
+
+
+class Video(Frames):
     """A stereo video.
 
     Parameters
@@ -43,6 +62,8 @@ class Video:
         The left camera's video, or both side by side.
     right : Path or None
         The right camera's video.
+    layout : str
+        Where the views are in the one video; see `stereokit.io.LAYOUTS`.
 
     Raises
     ------
@@ -52,7 +73,7 @@ class Video:
         If the two differ in size, or the one cannot be halved.
     """
 
-    def __init__(self, left: Path, right: Path | None = None) -> None:
+    def __init__(self, left: Path, right: Path | None = None, layout: str = "side-by-side") -> None:
         self.paths = [left] if right is None else [left, right]
         captures = [_open(path) for path in self.paths]
         try:
@@ -64,26 +85,32 @@ class Video:
         if len(set(sizes)) > 1:
             texts = " and ".join(f"{width}x{height}" for width, height in sizes)
             raise InputError(f"the two videos must have the same size, got {texts}")
-        if right is None and sizes[0][0] % 2:
-            raise InputError(f"a video with both views side by side must have an even width, got {sizes[0][0]}")
-        self.expected: int | None = min(counts) if min(counts) > 0 else None  # what the files say; it may be wrong
+        self.layout = layout
+        if right is None:
+            try:
+                split_views(np.empty(sizes[0][::-1], np.bool_), layout)
+            except OptionError as error:
+                raise InputError(f"the video: {error}") from None
+        self.expected: int | None = (
+            min(counts) if min(counts) > 0 else None
+        )  # by the files' headers, which may be wrong
 
     def frames(self, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[FramePair]:
-        """Yield the frames whose names are wanted; where one of two videos ends early, a last one says so."""
+        """Yield the frames whose names are wanted; where one of two videos ends early, a last one has the reason."""
         captures = [_open(path) for path in self.paths]
         try:
             number = 0
             while True:
                 name = f"{number:06d}"
                 with quiet_decoders():
-                    there = [capture.grab() for capture in captures]
-                if not all(there):
-                    if any(there):
-                        side = "left" if not there[0] else "right"
+                    grabbed = [capture.grab() for capture in captures]
+                if not all(grabbed):
+                    if any(grabbed):
+                        side = "left" if not grabbed[0] else "right"
                         yield FramePair(name, None, None, f"the {side} video ends before the other")
                     return
                 if wanted(name):
-                    yield _frame(name, captures)
+                    yield _frame(name, captures, self.layout)
                 number += 1
         finally:
             for capture in captures:
@@ -103,7 +130,7 @@ def _open(path: Path) -> Any:
     return capture
 
 
-def _frame(name: str, captures: list[Any]) -> FramePair:
+def _frame(name: str, captures: list[Any], layout: str) -> FramePair:
     images = []
     for capture in captures:
         with quiet_decoders():
@@ -112,6 +139,5 @@ def _frame(name: str, captures: list[Any]) -> FramePair:
             return FramePair(name, None, None, "the frame cannot be decoded")
         images.append(np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image))
     if len(images) == 1:
-        half = images[0].shape[1] // 2
-        images = [np.ascontiguousarray(images[0][:, :half]), np.ascontiguousarray(images[0][:, half:])]
+        images = list(split_views(images[0], layout))
     return FramePair(name, images[0], images[1])

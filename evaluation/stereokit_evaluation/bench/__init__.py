@@ -1,1 +1,1 @@
-"""Times, beside those of other matchers."""
+"""Times of our matchers and of other libraries."""

@@ -1,6 +1,7 @@
 """The contenders of ``stereokit bench --device cuda``: a match of images of the host, and of images on the device.
 
-A call ends when its map is there: on the host, or on the device with the stream waited for. The first call compiles.
+A call ends when its map is complete: on the host, or on the device after waiting for the stream. The first call
+compiles.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from stereokit.cuda.driver import require_device
 from stereokit.matching import Matcher
-from stereokit_evaluation.bench.peers import PEERS, Call, label
+from stereokit_evaluation.bench.baselines import BASELINES, Call, label
 
 __all__ = ["contenders", "maker"]
 
@@ -42,22 +43,22 @@ def _on_host(method: str, levels: int, scale: float) -> Call:
 
 def _on_device(method: str, levels: int, scale: float) -> Call:
     matcher = Matcher(method, max_disparity=levels, scale=scale, device="cuda")
-    held: list[Any] = []
+    device_images: list[Any] = []
 
     def call(left: Gray, right: Gray) -> Any:
-        if not held:  # in the first call, which is not timed
-            held.extend(_resident(image) for image in (left, right))
-        found = matcher.on_device(*held)
+        if not device_images:  # in the first call, which is not timed
+            device_images.extend(_resident(image) for image in (left, right))
+        result = matcher.on_device(*device_images)
         _wait()
-        return found.disparity
+        return result.disparity
 
     return call
 
 
 def contenders(methods: Sequence[str], scale: float) -> dict[str, Callable[[int], Call]]:
-    """Return what is timed by name: each takes the number of levels and returns the call.
+    """Return the contenders by name: each takes the number of levels and returns the call.
 
-    At half size images of the device are left out: what refines them there is PyTorch's, and so would be the time.
+    At half size, images on the device are left out: PyTorch refines their maps, and so would be the time.
 
     Raises
     ------
@@ -66,19 +67,19 @@ def contenders(methods: Sequence[str], scale: float) -> dict[str, Callable[[int]
     """
     require_device()
     half = ", half size" if scale != 1 else ""
-    found: dict[str, Callable[[int], Call]] = {}
+    builders: dict[str, Callable[[int], Call]] = {}
     for method in methods:
-        for what, build in ((HOST, _on_host), (RESIDENT, _on_device)):
-            if scale == 1 or what == HOST:
-                name = f"{label(method)}{half}, GPU, {what}"
-                found[name] = lambda levels, build=build, method=method: build(method, levels, scale)  # type: ignore[misc]
-    return found
+        for location, build in ((HOST, _on_host), (RESIDENT, _on_device)):
+            if scale == 1 or location == HOST:
+                name = f"{label(method)}{half}, GPU, {location}"
+                builders[name] = lambda levels, build=build, method=method: build(method, levels, scale)  # type: ignore[misc]
+    return builders
 
 
-def maker(ours: dict[str, Callable[[int], Call]]) -> Callable[[str, int, int], Call]:
-    """Return what makes the call of a contender, of ours or of a peer, from its name, the levels and threads."""
+def maker(builders: dict[str, Callable[[int], Call]]) -> Callable[[str, int, int], Call]:
+    """Return the factory of calls: it takes a contender's name, the levels and the threads."""
 
     def make(key: str, levels: int, threads: int) -> Call:
-        return ours[key](levels) if key in ours else PEERS[key].make(levels)
+        return builders[key](levels) if key in builders else BASELINES[key].make(levels)
 
     return make

@@ -1,10 +1,11 @@
-"""What can only be measured in a new process: memory that a call adds, and the first call after the import.
+"""Probes in a new process: the memory that a call adds, and the time of the first call after the import.
 
 ``python -m stereokit_evaluation.bench.probes memory|first SPEC`` prints one JSON object. `SPEC` is JSON with ``key``
-(see `stereokit_evaluation.bench.peers`), ``levels``, ``threads`` and the images' ``.npy`` files ``left`` and ``right``.
+(see `stereokit_evaluation.bench.baselines`), ``levels``, ``threads`` and ``left`` and ``right``, the images' ``.npy``
+files.
 
-The peak is the kernel's own count for the process (``VmHWM``), set back just before the call. ``ru_maxrss`` serves
-where there is none; it is not the first choice because on Linux a process inherits its parent's.
+The peak is the kernel's own count for the process (``VmHWM``), reset just before the call. Without it, ``ru_maxrss`` is
+used; it is not the first choice because on Linux a process inherits its parent's.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ if TYPE_CHECKING:  # the child imports as little as it can before the clock star
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["ProbeError", "first_call", "memory_added", "stored"]
+__all__ = ["ProbeError", "first_call", "image_files", "memory_added"]
 
 _TIMEOUT_S = 900
 
 
 class ProbeError(Exception):
-    """The new process failed; the message is the last line that it said."""
+    """A failure of the new process; the message is the last line of its standard error."""
 
 
 @contextmanager
-def stored(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Iterator[dict[str, str]]:
-    """Keep two images in temporary files for probes: yields their part of the specification."""
+def image_files(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Iterator[dict[str, str]]:
+    """Yield the entries of the specification for two images, stored in temporary files."""
     import numpy as np
 
     with TemporaryDirectory(prefix="stereokit-bench-") as folder:
@@ -46,12 +47,11 @@ def stored(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Iterator[dict[s
 
 
 def memory_added(key: str, levels: int, threads: int, images: dict[str, str]) -> float | None:
-    """Return the memory in MB (10**6 bytes) that one call adds at its peak, in a process that is ready for it.
+    """Return the memory in MB (10**6 bytes) that one call adds at its peak, None where the system has no count.
 
-    Images are loaded, and the code is compiled on a tiny pair, before the count begins. None where the system does
-    not tell. Raises ProbeError.
+    Images are loaded, and the code is compiled on a tiny pair, before the count begins. Raises ProbeError.
     """
-    added: int | None = _ask("memory", key, levels, threads, images)["bytes"]
+    added: int | None = _run_probe("memory", key, levels, threads, images)["bytes"]
     return None if added is None else added / 1e6
 
 
@@ -60,19 +60,19 @@ def first_call(key: str, levels: int, threads: int, images: dict[str, str]) -> d
 
     Raises ProbeError.
     """
-    return _ask("first", key, levels, threads, images)
+    return _run_probe("first", key, levels, threads, images)
 
 
-def _ask(what: str, key: str, levels: int, threads: int, images: dict[str, str]) -> dict[str, Any]:
+def _run_probe(probe: str, key: str, levels: int, threads: int, images: dict[str, str]) -> dict[str, Any]:
     import stereokit
     import stereokit_evaluation
 
-    homes = [str(Path(file).resolve().parents[1]) for file in (stereokit.__file__, stereokit_evaluation.__file__)]
-    path = os.pathsep.join([*dict.fromkeys(homes), *filter(None, [os.environ.get("PYTHONPATH")])])
+    folders = [str(Path(file).resolve().parents[1]) for file in (stereokit.__file__, stereokit_evaluation.__file__)]
+    path = os.pathsep.join([*dict.fromkeys(folders), *filter(None, [os.environ.get("PYTHONPATH")])])
     spec = json.dumps({"key": key, "levels": levels, "threads": threads, **images})
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", "stereokit_evaluation.bench.probes", what, spec],
+        process = subprocess.run(
+            [sys.executable, "-m", "stereokit_evaluation.bench.probes", probe, spec],
             env={**os.environ, "PYTHONPATH": path},
             capture_output=True,
             text=True,
@@ -80,19 +80,19 @@ def _ask(what: str, key: str, levels: int, threads: int, images: dict[str, str])
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise ProbeError(f"{what} probe: {error}") from error
-    if done.returncode != 0:
-        said = done.stderr.strip().splitlines()
-        raise ProbeError(f"{what} probe: {said[-1] if said else f'exit status {done.returncode}'}")
-    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return answer
+        raise ProbeError(f"{probe} probe: {error}") from error
+    if process.returncode != 0:
+        lines = process.stderr.strip().splitlines()
+        raise ProbeError(f"{probe} probe: {lines[-1] if lines else f'exit status {process.returncode}'}")
+    result: dict[str, Any] = json.loads(process.stdout.splitlines()[-1])
+    return result
 
 
 def _memory(spec: dict[str, Any]) -> dict[str, int | None]:
     import cv2
     import numpy as np
 
-    from stereokit_evaluation.bench.peers import make
+    from stereokit_evaluation.bench.baselines import make
 
     cv2.setNumThreads(spec["threads"])
     left, right = np.load(spec["left"]), np.load(spec["right"])
@@ -100,7 +100,7 @@ def _memory(spec: dict[str, Any]) -> dict[str, int | None]:
     tiny = np.random.default_rng(0).integers(0, 256, (2, 24, spec["levels"] + 64), np.uint8)
     call(*tiny)
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # sets the peak back to what is held now
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak to the present memory
     except OSError:
         pass
     before = _peak()
@@ -111,7 +111,7 @@ def _memory(spec: dict[str, Any]) -> dict[str, int | None]:
 
 
 def _peak() -> int | None:
-    """Return the most memory that this process has held, in bytes."""
+    """Return the peak of this process' memory, in bytes."""
     try:
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):

@@ -1,7 +1,7 @@
-"""Where the time of a call goes, stage by stage: an observer of the spans that the library names.
+"""The time of a call, stage by stage: an observer of the library's named spans.
 
-Times are exclusive: a stage does not count the stages inside it. What other threads do within a stage counts as that
-stage's, since the thread that called waits for it; single kernels show when a call has one thread.
+Times are exclusive: a stage does not count the stages inside it. The work of other threads counts for the stage that
+waits for them; with one thread, single kernels are visible.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ class StageTimer:
         self.clock = clock
         self.groups = groups
         self.seconds: dict[str, float] = {}
-        self._open: list[list[Any]] = []  # of each stage that is under way: name, start, seconds of stages inside it
+        self._stack: list[list[Any]] = []  # of each open stage: name, start, seconds of the stages inside it
 
     def enter(self, group: str, name: str) -> None:
         """Begin a stage."""
         key = group if self.groups else name
         self.seconds.setdefault(key, 0.0)
-        self._open.append([key, self.clock(), 0.0])
+        self._stack.append([key, self.clock(), 0.0])
 
     def leave(self) -> None:
         """End the stage that began last."""
-        key, start, inner = self._open.pop()
+        key, start, inner = self._stack.pop()
         took = self.clock() - start
         self.seconds[key] += took - inner
-        if self._open:
-            self._open[-1][2] += took
+        if self._stack:
+            self._stack[-1][2] += took
 
 
 def stage_times(
@@ -86,7 +86,7 @@ def stage_times(
     Returns
     -------
     dict of str to float
-        Stages in the order in which they first begin, then `OTHER`, what no stage accounts for, and `TOTAL`.
+        Stages in the order in which they first begin, then `OTHER`, the time outside of all stages, and `TOTAL`.
     """
     matcher = matching.Matcher(method, max_disparity=levels, threads=1, device="cpu")
     matcher(left, right)  # compiles
@@ -103,9 +103,9 @@ def stage_times(
 
 
 def allocated_bytes(method: str, levels: int, left: NDArray[np.uint8], right: NDArray[np.uint8], threads: int) -> int:
-    """Return the most bytes that a call holds above what it held before and the maps that it returns.
+    """Return the peak of the bytes that a call allocates, without the maps that it returns.
 
-    Of the third call: by then all buffers are there. Python and numpy count, what OpenCV takes inside does not.
+    It is measured on the third call, when all buffers exist. Memory of Python and numpy counts, OpenCV's own does not.
     """
     matcher = matching.Matcher(method, max_disparity=levels, threads=threads, device="cpu")
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""What ``stereokit bench`` found, as tables and as JSON.
+"""The result of ``stereokit bench``, as tables and as JSON.
 
 Times are milliseconds, memory is MB of 10**6 bytes. Ratios compare medians of the same size and number of threads.
 """
@@ -18,33 +18,33 @@ from rich.console import Console
 from stereokit.cli.output import Table
 from stereokit.kernels.simd import vector_bits
 from stereokit.kernels.threads import available_threads
-from stereokit_evaluation.bench.peers import HH, PEERS, THREE_WAY, label, usable_levels
+from stereokit_evaluation.bench.baselines import BASELINES, HH, THREE_WAY, label, usable_levels
 from stereokit_evaluation.bench.timing import Spread, ratio, spread
 from stereokit_evaluation.common import environment
 from stereokit_evaluation.common.sizes import Size
 
 __all__ = [
-    "Findings",
+    "BenchResult",
     "as_json",
     "format_ms",
-    "load",
     "machine",
     "new_table",
     "print_tables",
+    "system_load",
     "versions",
 ]
 
 
 @dataclass
-class Findings:
-    """All that was measured; an interrupt leaves it as far as it got.
+class BenchResult:
+    """All measurements; after an interrupt, those so far.
 
     Attributes
     ----------
     methods : list of str
-        Our methods; all other contenders are peers.
+        Our methods; all other contenders are baselines.
     sizes, threads, rounds
-        What was asked for.
+        The options of the run.
     times : dict
         Size's name and number of threads to contender to seconds of each run.
     memory : dict
@@ -56,11 +56,11 @@ class Findings:
     allocated : dict
         Size's name and method to bytes that a call in steady state takes above the maps that it returns, one thread.
     skipped : list of dict
-        Contenders that were left out, and why.
+        Contenders that were left out, with the reasons.
     interrupted : bool
-        Whether the user ended it.
+        Whether the user interrupted it.
     load : list of float or None
-        The system's load (1, 5 and 15 minutes) when it began: figures from a busy machine are worth little.
+        The system's load (1, 5 and 15 minutes) at the start: times from a busy machine are worth little.
     """
 
     methods: list[str]
@@ -75,64 +75,64 @@ class Findings:
     allocated: dict[tuple[str, str], int] = field(default_factory=dict)
     skipped: list[dict[str, Any]] = field(default_factory=list)
     interrupted: bool = False
-    load: list[float] | None = field(default_factory=lambda: load())
+    load: list[float] | None = field(default_factory=lambda: system_load())
 
     def skip(self, size: Size, contender: str, threads: int, reason: str) -> None:
-        """Note that a contender was left out."""
+        """Record that a contender was left out."""
         self.skipped.append({"size": size.name, "contender": contender, "threads": threads, "reason": reason})
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one row per size, contender and number of threads, as the JSON has it under ``results``."""
-        found: list[dict[str, Any]] = []
+        rows: list[dict[str, Any]] = []
         for size in self.sizes:
             for threads in self.threads:
                 times = self.times.get((size.name, threads), {})
                 spreads = {key: spread([1e3 * t for t in seconds]) for key, seconds in times.items() if seconds}
-                for key, ours in spreads.items():
-                    found.append(
+                for key, own in spreads.items():
+                    rows.append(
                         {
                             "size": size.name,
                             "contender": label(key),
                             "key": key,
                             "kind": "method" if key in self.methods else "peer",
                             "threads": threads,
-                            "runs": ours.runs,
-                            "median_ms": ours.median,
-                            "q25_ms": ours.q25,
-                            "q75_ms": ours.q75,
-                            "min_ms": ours.least,
-                            "x_hh": ratio(spreads.get(HH), ours),
-                            "x_3way": ratio(spreads.get(THREE_WAY), ours),
-                            "mde_per_s": _throughput(size, ours),
+                            "runs": own.runs,
+                            "median_ms": own.median,
+                            "q25_ms": own.q25,
+                            "q75_ms": own.q75,
+                            "min_ms": own.least,
+                            "x_hh": ratio(spreads.get(HH), own),
+                            "x_3way": ratio(spreads.get(THREE_WAY), own),
+                            "mde_per_s": _throughput(size, own),
                             "samples_ms": [1e3 * t for t in times[key]],
                         }
                     )
-        return found
+        return rows
 
 
-def _throughput(size: Size, ours: Spread) -> float | None:
-    return size.cells / ours.median / 1e3 if ours.median > 0 else None
+def _throughput(size: Size, times: Spread) -> float | None:
+    return size.cells / times.median / 1e3 if times.median > 0 else None
 
 
-def as_json(findings: Findings, options: dict[str, Any]) -> dict[str, Any]:
-    """Return everything that was found, with what is needed to understand it."""
-    most = max(findings.threads)
+def as_json(result: BenchResult, options: dict[str, Any]) -> dict[str, Any]:
+    """Return all measurements with their conditions."""
+    max_threads = max(result.threads)
 
-    def entry(size: str | None, key: str, threads: int, **figures: Any) -> dict[str, Any]:
-        return {"size": size, "contender": label(key), "key": key, "threads": threads, **figures}
+    def entry(size: str | None, key: str, threads: int, **values: Any) -> dict[str, Any]:
+        return {"size": size, "contender": label(key), "key": key, "threads": threads, **values}
 
     return {
-        "results": findings.rows(),
+        "results": result.rows(),
         "memory": [
-            entry(size, key, most, mb=amount, of_hh=_share(findings, size, key))
-            for (size, key), amount in findings.memory.items()
+            entry(size, key, max_threads, mb=amount, of_hh=_share(result, size, key))
+            for (size, key), amount in result.memory.items()
         ],
-        "first_call": [entry(findings.first_size, key, most, **seconds) for key, seconds in findings.first.items()],
+        "first_call": [entry(result.first_size, key, max_threads, **seconds) for key, seconds in result.first.items()],
         "stages": [
-            entry(size, key, 1, ms=stages, allocated_bytes=findings.allocated.get((size, key)))
-            for (size, key), stages in findings.stages.items()
+            entry(size, key, 1, ms=stages, allocated_bytes=result.allocated.get((size, key)))
+            for (size, key), stages in result.stages.items()
         ],
-        "skipped": findings.skipped,
+        "skipped": result.skipped,
         "sizes": {
             size.name: {
                 "width": size.width,
@@ -140,72 +140,72 @@ def as_json(findings: Findings, options: dict[str, Any]) -> dict[str, Any]:
                 "max_disparity": size.levels,
                 "opencv_disparities": usable_levels(size.levels),
             }
-            for size in findings.sizes
+            for size in result.sizes
         },
         "options": options,
-        "interrupted": findings.interrupted,
+        "interrupted": result.interrupted,
         "versions": versions(),
-        "machine": machine(findings.load),
+        "machine": machine(result.load),
     }
 
 
-def machine(at_start: list[float] | None) -> dict[str, Any]:
-    """Return what times depend on: processor, number of processors, vector width, system, and the given load."""
+def machine(load: list[float] | None) -> dict[str, Any]:
+    """Return the conditions of the times: processor, number of processors, vector width, system, and load."""
     return {
         "cpu": _cpu_name(),
         "processors": available_threads(),
         "vector_bits": vector_bits(),
         "system": f"{platform.system()} {platform.machine()}",
-        "load": at_start,
+        "load": load,
     }
 
 
-def print_tables(findings: Findings) -> None:
-    """Print one table of times per size, then first calls, stages and who was left out."""
+def print_tables(result: BenchResult) -> None:
+    """Print one table of times per size, then first calls, stages and the contenders that were left out."""
     console = Console(width=None if sys.stdout.isatty() else 120)
-    rows = findings.rows()
-    for size in findings.sizes:
-        here = [row for row in rows if row["size"] == size.name]
-        if here:
-            console.print(_times_table(findings, size, here))
-        stages = {key: ms for (name, key), ms in findings.stages.items() if name == size.name}
+    rows = result.rows()
+    for size in result.sizes:
+        size_rows = [row for row in rows if row["size"] == size.name]
+        if size_rows:
+            console.print(_times_table(result, size, size_rows))
+        stages = {key: ms for (name, key), ms in result.stages.items() if name == size.name}
         if stages:
-            allocated = {key: count for (name, key), count in findings.allocated.items() if name == size.name}
+            allocated = {key: count for (name, key), count in result.allocated.items() if name == size.name}
             console.print(_stages_table(size, stages, allocated))
-    if findings.first:
-        count = max(findings.threads)
-        table = new_table(f"first call in a new process, warm disk cache, {findings.first_size}, {_threads(count)}")
+    if result.first:
+        count = max(result.threads)
+        table = new_table(f"first call in a new process, warm disk cache, {result.first_size}, {_threads(count)}")
         for head in ("import s", "first call s"):
             table.add_column(head, justify="right")
-        for key, seconds in findings.first.items():
+        for key, seconds in result.first.items():
             table.add_row(label(key), f"{seconds['import_s']:.2f}", f"{seconds['call_s']:.2f}")
         console.print(table)
-    for skip in findings.skipped:
+    for skip in result.skipped:
         line = f"left out: {skip['contender']}, {skip['size']}, {_threads(skip['threads'])}: {skip['reason']}"
         console.print(line, markup=False, highlight=False)
     numbers = ", ".join(f"{name} {number}" for name, number in versions().items() if number)
-    busy = "" if findings.load is None else f", load {findings.load[0]:.1f} at the start"
-    place = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{busy}"
-    console.print(place, markup=False, highlight=False)
+    load_text = "" if result.load is None else f", load {result.load[0]:.1f} at the start"
+    processor = f"{_cpu_name()}, {available_threads()} processors, {vector_bits()}-bit vectors{load_text}"
+    console.print(processor, markup=False, highlight=False)
     console.print(numbers, highlight=False)
 
 
-def _times_table(findings: Findings, size: Size, rows: list[dict[str, Any]]) -> Table:
+def _times_table(result: BenchResult, size: Size, rows: list[dict[str, Any]]) -> Table:
     table = new_table(
-        f"{size.name}: {size.width}x{size.height}, {size.levels} levels, median of {findings.rounds} rounds"
+        f"{size.name}: {size.width}x{size.height}, {size.levels} levels, median of {result.rounds} rounds"
     )
-    weighed = any(name == size.name for name, _ in findings.memory)
-    heads = ["threads", "ms", "q25-q75", "min", "x HH", "x 3WAY", "MDE/s", *(("MB", "of HH's") if weighed else ())]
+    has_memory = any(name == size.name for name, _ in result.memory)
+    heads = ["threads", "ms", "q25-q75", "min", "x HH", "x 3WAY", "MDE/s", *(("MB", "of HH's") if has_memory else ())]
     for head in heads:
         table.add_column(head, justify="right")
     for index, row in enumerate(rows):
-        key, most = row["key"], row["threads"] == max(findings.threads)
+        key, is_max = row["key"], row["threads"] == max(result.threads)
         memory: tuple[str, ...] = ()
-        if weighed:
-            amount = findings.memory.get((size.name, key)) if most else None
-            share = _share(findings, size.name, key) if most else None
+        if has_memory:
+            amount = result.memory.get((size.name, key)) if is_max else None
+            share = _share(result, size.name, key) if is_max else None
             memory = (_figure(amount, 0 if amount and amount >= 10 else 1), _figure(share, 2))
-        runs = "" if row["runs"] == findings.rounds else f" ({row['runs']} runs)"
+        runs = "" if row["runs"] == result.rounds else f" ({row['runs']} runs)"
         table.add_row(
             row["contender"] + runs,
             str(row["threads"]),
@@ -264,18 +264,18 @@ def _times_faster(value: float | None, kind: str) -> str:
     return f"[bold red]{text}[/]" if value is not None and value < 1 and kind == "method" else text
 
 
-def _share(findings: Findings, size: str, key: str) -> float | None:
-    ours, theirs = findings.memory.get((size, key)), findings.memory.get((size, HH))
-    return ours / theirs if ours is not None and theirs else None
+def _share(result: BenchResult, size: str, key: str) -> float | None:
+    own_mb, hh_mb = result.memory.get((size, key)), result.memory.get((size, HH))
+    return own_mb / hh_mb if own_mb is not None and hh_mb else None
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of this package and of those that times depend on."""
-    return environment.versions({peer.module for peer in PEERS.values()} - {"cv2"})
+    """Return the versions of this package and of those that the times depend on."""
+    return environment.versions({baseline.module for baseline in BASELINES.values()} - {"cv2"})
 
 
-def load() -> list[float] | None:
-    """Return the system's load over 1, 5 and 15 minutes, None where it does not tell."""
+def system_load() -> list[float] | None:
+    """Return the system's load over 1, 5 and 15 minutes, None where the system has none."""
     try:
         return list(os.getloadavg())
     except (AttributeError, OSError):  # not on Windows

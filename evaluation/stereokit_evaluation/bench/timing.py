@@ -18,14 +18,14 @@ __all__ = ["Spread", "ratio", "round_robin", "spread"]
 
 @dataclass(frozen=True)
 class Spread:
-    """What is reported of repeated times.
+    """Summary statistics of repeated times.
 
     Attributes
     ----------
     median, q25, q75, least : float
         Median, quartiles (linear interpolation) and minimum, in the unit of the times.
     runs : int
-        How many times there were.
+        Their number.
     """
 
     median: float
@@ -49,11 +49,11 @@ def spread(times: list[float]) -> Spread:
     return Spread(median, q25, q75, float(min(times)), len(times))
 
 
-def ratio(peer: Spread | None, ours: Spread | None) -> float | None:
-    """Return how many times faster `ours` is than `peer`, by medians; None where one is missing or took no time."""
-    if peer is None or ours is None or ours.median <= 0:
+def ratio(baseline: Spread | None, ours: Spread | None) -> float | None:
+    """Return how many times faster `ours` is than `baseline`, by medians; None where one is missing or took no time."""
+    if baseline is None or ours is None or ours.median <= 0:
         return None
-    return peer.median / ours.median
+    return baseline.median / ours.median
 
 
 def round_robin(
@@ -61,7 +61,7 @@ def round_robin(
     rounds: int,
     times: dict[str, list[float]],
     *,
-    most: Mapping[str, int] | None = None,
+    max_rounds: Mapping[str, int] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     step: Callable[[str], None] | None = None,
 ) -> None:
@@ -70,12 +70,12 @@ def round_robin(
     Parameters
     ----------
     calls : mapping of str to callable
-        What to time. Results are freed outside the timed part.
+        The calls to time. Results are freed outside the timed part.
     rounds : int
         Number of rounds.
     times : dict of str to list of float
-        Seconds are appended here, run by run, so that an interrupt leaves all that was measured.
-    most : mapping of str to int or None
+        Seconds are appended here, run by run, so that an interrupt leaves all measurements so far.
+    max_rounds : mapping of str to int or None
         Names that take part in the first so many rounds only.
     clock : callable
         Returns seconds.
@@ -84,12 +84,12 @@ def round_robin(
     """
     for number in range(rounds):
         for name, call in calls.items():
-            if most is not None and number >= most.get(name, rounds):
+            if max_rounds is not None and number >= max_rounds.get(name, rounds):
                 continue
-            begun = clock()
+            start = clock()
             result = call()
-            ended = clock()
+            end = clock()
             del result
-            times.setdefault(name, []).append(ended - begun)
+            times.setdefault(name, []).append(end - start)
             if step is not None:
                 step(name)

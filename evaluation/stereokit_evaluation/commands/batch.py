@@ -1,27 +1,31 @@
 """The command ``stereokit batch``: maps of all pairs of a folder, a list or a video, on this machine or on a cluster.
 
-What is there already is left alone, so that the same command goes on after an interrupt, a kill or a full disk. A pair
-that fails is named and costs nobody else anything. For scripts there is `stereokit_evaluation.batch.run.run_batch`;
-what a folder and a list may look like is told in `stereokit_evaluation.batch.pairs`.
+Existing maps stay, so that the same command resumes after an interrupt, a kill or a full disk. A pair that fails is
+named, and the others go on. For scripts there is `stereokit_evaluation.batch.run.run_batch`; the formats of folders and
+lists are in `stereokit_evaluation.batch.pairs`.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 
+from stereokit.calibration import Calibration
 from stereokit.cli.options import (
     DeviceOption,
     FillOption,
     JsonOption,
+    LayoutOption,
     MaxDisparityOption,
     MethodOption,
     MinDisparityOption,
@@ -35,14 +39,18 @@ from stereokit.cli.options import (
     write_json,
 )
 from stereokit.cli.output import Table
+from stereokit.cli.pair import AlignOption, MaskOption, NodataOption, RightMaskOption, StrictOption
+from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, rig_files
 from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
-from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES
+from stereokit.io import DISPARITY_SUFFIXES, LAYOUTS, READABLE_SUFFIXES, read_disparity, read_image
+from stereokit_evaluation.batch.bags import Bag, is_bag, write_bag
+from stereokit_evaluation.batch.combined import CombinedFiles
 from stereokit_evaluation.batch.job import Job, matcher_of
-from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, Pair, folder_pairs, folders_pairs, list_pairs
+from stereokit_evaluation.batch.pairs import LIST_SUFFIXES, PairFiles, folder_pairs, folders_pairs, list_pairs
 from stereokit_evaluation.batch.run import Engine, Summary, identity, on_threads, run_batch
 from stereokit_evaluation.batch.store import write_document
-from stereokit_evaluation.batch.video import Video
+from stereokit_evaluation.batch.video import Frames, Video
 from stereokit_evaluation.common.progress import progress
 
 __all__ = ["batch", "find_pairs"]
@@ -64,10 +72,22 @@ def batch(
     fill: FillOption = None,
     device: DeviceOption = "auto",
     settings: SettingsOption = None,
+    mask: MaskOption = None,
+    right_mask: RightMaskOption = None,
+    nodata: NodataOption = None,
+    align: AlignOption = False,
+    strict: StrictOption = False,
     file_format: Annotated[str, typer.Option("--format", help="png (KITTI), pfm, npy or tiff.")] = "png",
     color: Annotated[bool, typer.Option("--color", help="Also coloured pictures, in DIR/color.")] = False,
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     pattern: Annotated[
         tuple[str, str] | None, typer.Option(metavar="LEFT RIGHT", help="Files of a folder, '*_l.png' '*_r.png'.")
+    ] = None,
+    layout: LayoutOption = None,
+    topics: Annotated[str | None, typer.Option(metavar="LEFT,RIGHT", help="Image topics of a ROS bag.")] = None,
+    bag: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Of a ROS bag: also a bag of the maps, in metres.")
     ] = None,
     engine: Annotated[str, typer.Option(help="local or dask.")] = "local",
     scheduler: Annotated[str | None, typer.Option(help="Address or file of the Dask scheduler.")] = None,
@@ -75,12 +95,12 @@ def batch(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Make all maps anew.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Match all pairs of a folder, a list or a video; go on where an earlier run ended.
+    """Match all pairs of a folder, a list or a video; resume where an earlier run ended.
 
     A folder has left and right, or image_2 and image_3, or files NAME_left and NAME_right, or others by --pattern; a
-    list has lines left,right[,name]; a video has both views side by side, or is two files. Maps that are there are not
-    made again, and must come from the same inputs and options. Pairs that fail are named, and the exit status is then
-    1.
+    list has lines left,right[,name]; a video has both views side by side, or is two files. Existing maps stay,
+    and must come from the same inputs and options. Pairs that fail are named, and the exit status is then 1.
+    With --rig the images are raw ones, and are rectified first.
     """
     check_json(json_file)
     if file_format not in _FORMATS:
@@ -88,8 +108,8 @@ def batch(
     if file_format == "png":
         check_fits_png("--format png", min_disparity, max_disparity)
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
-    given = {"refiner": refiner, "weights": weights, "fill": fill}
-    options.update({name: value for name, value in given.items() if value is not None})
+    user_options = {"refiner": refiner, "weights": weights, "fill": fill, "nodata": nodata}
+    options.update({name: value for name, value in user_options.items() if value is not None})
     options["device"] = device
     options.update(parse_settings(settings or (), _OWN_OPTIONS))
     for name in ("right", "confidence"):
@@ -99,35 +119,73 @@ def batch(
         options["refiner"] = os.path.abspath(refiner)
     if weights is not None and weights.endswith(".safetensors"):
         options["weights"] = os.path.abspath(weights)
-    where = os.path.abspath(output)
-    job = Job(where, f".{file_format}", color, method, tuple(sorted(options.items())))
-    matcher_of(job)  # refuses what cannot be
+    folder = os.path.abspath(output)
+    check_rig_options(rig, alpha)
+    raw = () if rig is None else tuple(os.path.abspath(path) for path in rig_files(rig))
+    left_mask, other_mask = (None if path is None else os.path.abspath(path) for path in (mask, right_mask))
+    for path in (mask, right_mask):
+        if path is not None:
+            read_image(path)  # refuses what is none
+    ordered = tuple(sorted(options.items()))
+    job = Job(folder, f".{file_format}", color, method, ordered, raw, alpha, left_mask, other_mask, align, strict)
+    matcher_of(job)  # refuses bad options
     run_on, engine_options, client = _engine(engine, scheduler, workers)
     try:
-        source, origin = find_pairs(inputs, pattern)
-        total = source.expected if isinstance(source, Video) else len(source)
+        source, origin = find_pairs(inputs, pattern, layout, topics)
+        camera = _check_bag(bag, source, rig)
+        total = source.expected if isinstance(source, Frames) else len(source)
         summary = _run(job, source, run_on, origin, overwrite, total)
     finally:
         if client is not None:
             client.close()
-    if isinstance(source, Video) and source.expected and summary.pairs < source.expected and not summary.interrupted:
-        summary.notes.append(f"the video says {source.expected} frames, {summary.pairs} could be read")
-    document = {**summary.as_json(), "output": where, **engine_options, "options": identity(job, origin)}
-    if Path(where).is_dir() and not summary.vanished:
-        write_document(Path(where) / "summary.json", document)
+    if isinstance(source, Frames) and source.expected and summary.pairs < source.expected and not summary.interrupted:
+        summary.notes.append(f"{source.expected} frames were expected, {summary.pairs} could be read")
+    document = {**summary.as_json(), "output": folder, **engine_options, "options": identity(job, origin)}
+    if Path(folder).is_dir() and not summary.vanished:
+        write_document(Path(folder) / "summary.json", document)
+    if bag is not None and camera is not None and not (summary.interrupted or summary.stopped):
+        limits = float(min_disparity), float(max_disparity)
+        summary.notes.append(f"{write_bag(bag, _maps(job), camera, limits=limits)} maps are in the bag {str(bag)!r}")
     printed = write_json(json_file, document)
     _finish(summary, job, printed)
 
 
-def find_pairs(inputs: Sequence[Path], pattern: tuple[str, str] | None = None) -> tuple[list[Pair] | Video, list[str]]:
-    """Return the pairs that the inputs of the command have, and what a manifest calls the inputs.
+def _check_bag(bag: Path | None, source: list[PairFiles] | Frames, rig: str | None) -> Calibration | None:
+    """Return the calibration of the maps of ``--bag``; refuse what cannot be before anything is matched."""
+    if bag is None:
+        return None
+    if not isinstance(source, Bag) or rig is not None:
+        raise OptionError("--bag needs a ROS bag of rectified images as input")
+    if bag.exists():
+        raise OptionError(f"--bag must not exist, got {str(bag)!r}")
+    camera = source.calibration()
+    if camera is None:
+        raise OptionError("--bag needs the camera_info of a rectified pair beside the images, which the input lacks")
+    return camera
+
+
+def _maps(job: Job) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield the stamps and maps of a folder, in the order of time."""
+    folder = Path(job.folder)
+    for path in sorted(path for path in folder.iterdir() if path.suffix == job.suffix and path.stem.isdigit()):
+        yield int(path.stem), read_disparity(path)
+
+
+def find_pairs(
+    inputs: Sequence[Path], pattern: tuple[str, str] | None = None, layout: str | None = None, topics: str | None = None
+) -> tuple[list[PairFiles] | Frames, list[str]]:
+    """Return the pairs of the command's inputs, and the names of the inputs in a manifest.
 
     Parameters
     ----------
     inputs : sequence of Path
-        One folder, list or video; or two folders or videos, left and right.
+        One folder, list, video or ROS bag; or two folders or videos, left and right.
     pattern : (left, right) or None
         For one folder: names of files with one ``*``.
+    layout : str or None
+        For one folder of images, or one video, that hold both views: where they are.
+    topics : str or None
+        ``LEFT,RIGHT`` of a bag.
 
     Raises
     ------
@@ -139,17 +197,30 @@ def find_pairs(inputs: Sequence[Path], pattern: tuple[str, str] | None = None) -
     for path in inputs:
         if not path.exists():
             raise FileError(f"no such file or folder: {str(path)!r}")
-        if (
-            path.is_file() and path.suffix.lower() in READABLE_SUFFIXES
-        ):  # which OpenCV would take for a video of one frame
+        if path.is_file() and path.suffix.lower() in READABLE_SUFFIXES:  # OpenCV would take it for a video of one frame
             raise OptionError(
-                f"inputs must be folders, lists or videos, got the image {str(path)!r}; for one pair: match"
+                f"inputs must be folders, lists, videos or bags, got the image {str(path)!r}; for one pair: match"
             )
     origin = [os.path.abspath(path) for path in inputs]
+    if layout is not None and layout not in LAYOUTS:
+        raise OptionError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    if len(inputs) == 1 and is_bag(inputs[0]):
+        if pattern is not None or layout is not None:
+            raise OptionError("pattern and layout are not for ROS bags")
+        chosen = None if topics is None else topics.split(",")
+        return Bag(inputs[0], chosen), [*origin, *(chosen or ())]
+    if topics is not None:
+        raise OptionError("topics needs one ROS bag as input")
     if pattern is not None:
-        if len(inputs) != 1 or not inputs[0].is_dir():
-            raise OptionError("pattern needs one folder as input")
+        if len(inputs) != 1 or not inputs[0].is_dir() or layout is not None:
+            raise OptionError("pattern needs one folder as input, and no layout")
         return folder_pairs(inputs[0], pattern), [*origin, *pattern]
+    if layout is not None:
+        if len(inputs) != 1 or inputs[0].suffix.lower() in LIST_SUFFIXES:
+            raise OptionError("layout needs one folder or one video as input")
+        if inputs[0].is_dir():
+            return CombinedFiles(inputs[0], layout), [*origin, layout]
+        return Video(inputs[0], layout=layout), [*origin, layout]
     if len(inputs) == 1:
         if inputs[0].is_dir():
             return folder_pairs(inputs[0]), origin
@@ -162,7 +233,7 @@ def find_pairs(inputs: Sequence[Path], pattern: tuple[str, str] | None = None) -
         return folders_pairs(*inputs), origin
     if any(path.is_dir() or path.suffix.lower() in LIST_SUFFIXES for path in inputs):
         raise OptionError("two inputs must be two folders or two videos, left and right")
-    return Video(*inputs), origin
+    return Video(inputs[0], inputs[1]), origin
 
 
 def _engine(name: str, scheduler: str | None, workers: int | None) -> tuple[Engine, dict[str, Any], Any]:
@@ -184,32 +255,35 @@ def _engine(name: str, scheduler: str | None, workers: int | None) -> tuple[Engi
 
 
 def _run(
-    job: Job, source: list[Pair] | Video, run_on: Engine, origin: list[str], overwrite: bool, total: int | None
+    job: Job, source: list[PairFiles] | Frames, run_on: Engine, origin: list[str], overwrite: bool, total: int | None
 ) -> Summary:
-    seen = told = doubted = 0
+    pair_count = error_count = warning_count = 0
     with progress(total) as (console, step):
 
-        def tell(line: str) -> None:
+        def report(line: str) -> None:
             console.print(one_line(line), markup=False, highlight=False, soft_wrap=True)
 
         def show(summary: Summary) -> None:
-            nonlocal seen, told, doubted
-            for name, reason in summary.errors[told:_SHOWN_ERRORS]:
-                tell(f"failed {name}: {reason}")
-                told += 1
-            for name, line in summary.doubts[doubted:_SHOWN_ERRORS]:
-                tell(f"warning: {name}: {line}")
-                doubted += 1
+            nonlocal pair_count, error_count, warning_count
+            for name, reason in summary.errors[error_count:_SHOWN_ERRORS]:
+                report(f"failed {name}: {reason}")
+                error_count += 1
+            for name, line in summary.warnings[warning_count:_SHOWN_ERRORS]:
+                report(f"warning: {name}: {line}")
+                warning_count += 1
             rate = summary.pairs_per_second
-            step("" if rate is None else f"{rate:.1f} pairs/s", summary.pairs - seen)
-            seen = summary.pairs
+            step("" if rate is None else f"{rate:.1f} pairs/s", summary.pairs - pair_count)
+            pair_count = summary.pairs
 
         summary = run_batch(job, source, run_on, inputs=origin, overwrite=overwrite, progress=show)
-        for what, count in (("failed", len(summary.errors) - told), ("doubtful", len(summary.doubts) - doubted)):
+        for kind, count in (
+            ("failed", len(summary.errors) - error_count),
+            ("doubtful", len(summary.warnings) - warning_count),
+        ):
             if count > 0:
-                tell(f"... and {count} more {what}, all in summary.json")
+                report(f"... and {count} more {kind}, all in summary.json")
         if summary.interrupted:
-            tell("interrupted: the same command goes on from here")
+            report("interrupted: the same command goes on from here")
     return summary
 
 
@@ -221,7 +295,7 @@ def _finish(summary: Summary, job: Job, printed: bool) -> None:
         for head in ("method", "pairs", "written", "there before", "failed", "seconds", "pairs/s"):
             table.add_column(head, justify="left" if head == "method" else "right", no_wrap=True)
         rate = summary.pairs_per_second
-        counts = (summary.pairs, summary.written, summary.found, summary.failed)
+        counts = (summary.pairs, summary.written, summary.existing, summary.failed)
         seconds = f"{summary.seconds:.1f}", "-" if rate is None else f"{rate:.2f}"
         table.add_row(matcher_of(job).method, *map(str, counts), *seconds)
         Console(width=None if sys.stdout.isatty() else 120).print(table)

@@ -55,7 +55,7 @@ class Panel:
     disparity, error : (H, W, 3) uint8
         Pictures of the disparity map and of its error, RGB.
     d1 : float or None
-        D1 error of the pixels that both views show, percent.
+        D1 error of the pixels that are visible in both views, percent.
     milliseconds : float or None
         Time of one call.
     """
@@ -79,7 +79,7 @@ class _Outcome:
 
 
 def overview(left: Picture, truth: Picture, panels: Sequence[Panel], *, tile_width: int = 621) -> Picture:
-    """Draw a labelled grid of two columns: left image and truth, then each method's disparity and error.
+    """Draw a labelled table of pictures in two columns: left image and truth, then each method's disparity and error.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def overview(left: Picture, truth: Picture, panels: Sequence[Panel], *, tile_wid
     panels : sequence of Panel
         The methods, top to bottom, their pictures as large as `left`.
     tile_width : int
-        Width of one picture in the grid, pixels; its height follows.
+        Width of one picture, pixels; its height follows.
 
     Returns
     -------
@@ -153,12 +153,12 @@ def demo(
     _check_places(output, json_file)
     from stereokit import METHODS, Matcher
 
-    short = {full: name for name, full in METHODS.items()}
+    short = {method_name: name for name, method_name in METHODS.items()}
     matchers: dict[str, Any] = {}
     for name in method or list(METHODS):
         matcher = Matcher(name, max_disparity=max_disparity, threads=threads)
-        full = str(matcher.method)
-        matchers.setdefault(f"{short[full]} {full}" if full in short else full, matcher)
+        method_name = str(matcher.method)
+        matchers.setdefault(f"{short[method_name]} {method_name}" if method_name in short else method_name, matcher)
     console = Console(stderr=True)
     if refiner != "none":
         options: dict[str, Any] = {"max_disparity": max_disparity, "threads": threads, "scale": 0.5}
@@ -174,14 +174,14 @@ def demo(
     outcomes: list[_Outcome] = []
     for label, matcher in matchers.items():
         with console.status(Text(f"{label}: compiling, once")):
-            found = matcher(left, right)
+            result = matcher(left, right)
         times = []
         for _ in range(_RUNS):
             start = time.perf_counter()
-            found = matcher(left, right)
+            result = matcher(left, right)
             times.append(time.perf_counter() - start)
-        scored = score(found.disparity, noc=scene.noc, occ=scene.occ, objects=scene.objects, measured=found.valid)
-        outcomes.append(_Outcome(matcher, label, found.disparity, scored, statistics.median(times)))
+        scores = score(result.disparity, noc=scene.noc, occ=scene.occ, objects=scene.objects, measured=result.valid)
+        outcomes.append(_Outcome(matcher, label, result.disparity, scores, statistics.median(times)))
     make_folder(output)
     _write_pictures(output, scene, outcomes)
     document = {"results": [_as_json(outcome) for outcome in outcomes]}
@@ -192,30 +192,32 @@ def demo(
 
 
 def _parse_size(size: str) -> tuple[int, int]:
-    found = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", size.strip())
-    if not found or not int(found[1]) or not int(found[2]):
+    match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", size.strip())
+    if not match or not int(match[1]) or not int(match[2]):
         raise OptionError(f"size must be WIDTHxHEIGHT in pixels, such as 1242x375, got {size!r}")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def _check_places(output: Path, json_file: Path | None) -> None:
-    """Refuse what cannot be written before any work is done."""
+    """Refuse outputs that cannot be written, before any work."""
     check_json(json_file)
     check_folder(output)
 
 
 def _write_pictures(folder: Path, scene: Scene, outcomes: Sequence[_Outcome]) -> None:
     """Write left, right, truth, each method's maps and the overview; a colour means the same in all."""
-    high = max(1.0, float(scene.disparity.max()))
-    truth = colorize(scene.disparity, 0.0, high)
+    max_disparity = max(1.0, float(scene.disparity.max()))
+    truth = colorize(scene.disparity, 0.0, max_disparity)
     panels: list[Panel] = []
     pictures = {"left": scene.left, "right": scene.right, "truth": truth}
     for outcome in outcomes:
-        found = colorize(outcome.disparity, 0.0, high)
-        wrong = error_map(outcome.disparity, scene.occ, scene.noc, dilate=False)
+        map_picture = colorize(outcome.disparity, 0.0, max_disparity)
+        error_picture = error_map(outcome.disparity, scene.occ, scene.noc, dilate=False)
         stem = outcome.label.split()[0].replace("/2", "-half").replace("+", "-")
-        pictures |= {stem: found, f"{stem}_error": wrong}
-        panels.append(Panel(outcome.label, found, wrong, outcome.score.noc.all.filled.d1(), 1000 * outcome.seconds))
+        pictures |= {stem: map_picture, f"{stem}_error": error_picture}
+        panels.append(
+            Panel(outcome.label, map_picture, error_picture, outcome.score.noc.all.filled.d1(), 1000 * outcome.seconds)
+        )
     pictures["overview"] = overview(scene.left, truth, panels)
     for name, picture in pictures.items():
         write_image(folder / f"{name}.png", picture)

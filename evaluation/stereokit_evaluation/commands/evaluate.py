@@ -25,7 +25,7 @@ from stereokit.io import write_image
 from stereokit_evaluation.common.folders import make_folder
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.common.weights import check_weights, weights_option
-from stereokit_evaluation.data.datasets import load, select
+from stereokit_evaluation.data.datasets import dataset_names, load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.error_map import error_map
 from stereokit_evaluation.scoring.runner import (
@@ -40,7 +40,7 @@ from stereokit_evaluation.scoring.runner import (
     seen_in_training,
     with_matcher,
 )
-from stereokit_evaluation.scoring.summary import figures
+from stereokit_evaluation.scoring.summary import summary
 
 __all__ = ["Result", "evaluate", "run"]
 
@@ -51,7 +51,7 @@ _OWN_OPTIONS = frozenset(("method", "scale", "refiner", "weights", "device", "th
 
 @dataclass(frozen=True)
 class _Run:
-    """One row of the table: what is scored, and the words that describe it."""
+    """One row of the table: an estimator and its description."""
 
     estimate: Estimator
     method: str
@@ -62,17 +62,17 @@ class _Run:
 
     @property
     def folder(self) -> str:
-        """The name of a folder for its pictures, which no other row has."""
+        """The unique name of the folder of its pictures."""
         return self.method if self.refiner is None else f"{self.method}-{Path(self.refiner).name}"
 
 
 def evaluate(
-    dataset: Annotated[str, typer.Option(help="kitti2015, kitti2012, middlebury, eth3d, folder or scenes.")],
+    dataset: Annotated[str, typer.Option(help=f"One of {', '.join(dataset_names())}.")],
     root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
     frames: Annotated[str | None, typer.Option(help="Numbers or names, such as 0-3,34-40.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,
-    scale: Annotated[float, typer.Option(help="1, or 0.5 to match at half size.")] = 1.0,
-    refiner: Annotated[list[str] | None, typer.Option(help="Refiner for the half-size map; may repeat.")] = None,
+    scale: Annotated[float, typer.Option(help="1, or 0.5 or 0.25 to match at a smaller size.")] = 1.0,
+    refiner: Annotated[list[str] | None, typer.Option(help="Refiner of the map; may repeat.")] = None,
     weights: WeightsOption = None,
     predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
@@ -89,23 +89,23 @@ def evaluate(
     Frames that cannot be read are named on standard error and left out; the exit status is then 1.
     """
     check_json(json_file)
-    chosen = select(load(dataset, root, count=count), frames)
+    selected = select_frames(load_frames(dataset, root, count=count), frames)
     options: dict[str, Any]
     if predictions is not None:
-        given: dict[str, Any] = {
+        conflicts: dict[str, Any] = {
             "method": method,
             "refiner": refiner,
             "weights": weights,
             "set": settings,
             "threads": threads,
         }
-        given |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
-        for name in (name for name, value in given.items() if value is not None and value != []):
-            raise OptionError(f"{name} must not be given with predictions, got {given[name]!r}")
+        conflicts |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
+        for name in (name for name, value in conflicts.items() if value is not None and value != []):
+            raise OptionError(f"{name} must not be set with predictions, got {conflicts[name]!r}")
         options = {"predictions": str(predictions)}
         runs = [_Run(from_files(predictions), "predictions")]
     else:
-        suggested = [frame.max_disparity for frame in chosen if frame.max_disparity is not None]
+        suggested = [frame.max_disparity for frame in selected if frame.max_disparity is not None]
         if max_disparity is None:
             max_disparity = max(suggested, default=_DEFAULT_DISPARITIES)
         options = {"max_disparity": max_disparity, "threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
@@ -116,10 +116,10 @@ def evaluate(
             for name in methods
             for refine in (dict.fromkeys(refiner) if refiner else (None,))
         ]
-    seen = (seen_in_training(job.matcher, dataset, chosen) for job in runs)
-    for line in dict.fromkeys(line for line in seen if line is not None):
+    notes = (seen_in_training(job.matcher, dataset, selected) for job in runs)
+    for line in dict.fromkeys(line for line in notes if line is not None):
         typer.echo(f"note: {line}", err=True)
-    results, interrupted = _execute(runs, chosen, error_maps)
+    results, interrupted = _execute(runs, selected, error_maps)
     skipped = list(dict.fromkeys(skip for result in results for skip in result.skipped))
     document = {
         "results": [_as_json(job, result) for job, result in zip(runs, results, strict=False)],
@@ -130,7 +130,7 @@ def evaluate(
         "version": __version__,
     }
     if not write_json(json_file, document):
-        _print_table(f"{dataset}, {len(chosen)} frames", runs, results)
+        _print_table(f"{dataset}, {len(selected)} frames", runs, results)
     if interrupted:
         raise typer.Exit(130)
     if skipped:
@@ -148,9 +148,9 @@ def _matcher_run(
 
 
 def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -> tuple[list[Result], bool]:
-    """Run all, printing skipped frames as they come; an interrupt ends the work and keeps what was done."""
+    """Run all and print skipped frames at once; an interrupt ends the work, and the results so far are returned."""
     results: list[Result] = []
-    told: set[str] = set()
+    printed: set[str] = set()
     with progress(len(runs) * len(frames)) as (console, step):
         for job in runs:
             scored: list[Scored] = []
@@ -160,14 +160,14 @@ def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -
                 for outcome in score_frames(frames, job.estimate, draw):
                     if isinstance(outcome, Scored):
                         scored.append(outcome)
-                        lines = [f"warning: {outcome.name}: {line}" for line in outcome.doubts]
+                        lines = [f"warning: {outcome.name}: {line}" for line in outcome.warnings]
                     else:
                         skipped.append(outcome)
                         lines = [f"skipped {outcome.name}: {outcome.reason}"]
                     for line in map(one_line, lines):
-                        if line not in told:
+                        if line not in printed:
                             console.print(line, markup=False, highlight=False, soft_wrap=True)
-                            told.add(line)
+                            printed.add(line)
                     step(f"{job.method} {outcome.name}")
             except KeyboardInterrupt:
                 console.print("interrupted: the figures cover the frames done so far", highlight=False)
@@ -179,12 +179,12 @@ def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -
 def _draws(folder: Path) -> Callable[..., None]:
     make_folder(folder, "error_maps")
 
-    def draw(frame: Frame, found: Estimate, noc: NDArray[Any] | None, occ: NDArray[Any] | None) -> None:
-        everything = noc if occ is None else occ
-        if everything is None:
+    def draw(frame: Frame, estimate: Estimate, noc: NDArray[Any] | None, occ: NDArray[Any] | None) -> None:
+        truth = noc if occ is None else occ
+        if truth is None:
             return
         name = frame.name.replace("/", "_")
-        write_image(folder / f"{name}.png", error_map(found.disparity, everything, noc))
+        write_image(folder / f"{name}.png", error_map(estimate.disparity, truth, noc))
 
     return draw
 
@@ -219,5 +219,5 @@ def _half(scale: float | None) -> str:
 
 def _as_json(job: _Run, result: Result) -> dict[str, Any]:
     """Return one entry of ``results``."""
-    described = {"method": job.method, "scale": job.scale, "refiner": job.refiner, "device": job.device}
-    return {**described, **figures(result)}
+    entry = {"method": job.method, "scale": job.scale, "refiner": job.refiner, "device": job.device}
+    return {**entry, **summary(result)}

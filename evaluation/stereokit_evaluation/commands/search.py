@@ -1,12 +1,12 @@
 """The search behind the defaults: one option at a time around them, on the frames that are named for tuning.
 
-``python -m stereokit_evaluation.commands.search --data DIR --method S2 --output S2.csv`` scores each setting on
+``python -m stereokit_evaluation.commands.search --data DIR --method S2 --output S2.csv`` scores each set of options on
 the tuning frames of KITTI 2015 (000013-000033, 000046, 000072, 000104, 000115: whole drives, so that no neighbour in
 time is among the validation frames 000000-000003 and 000034-000040) and on Middlebury's cones, teddy and Motorcycle.
-A setting is chosen by the tuning column and the three scenes; validation is printed beside it and not searched on.
+Options are chosen by the tuning column and the three scenes; validation is printed too and not searched on.
 
-`DIR` holds ``kitti2015`` and ``middlebury/{2003/cones, 2003/teddy, 2014/Motorcycle}``. Rows are appended to the CSV
-as they are done; settings that are in it are not run again. ``--scale 0.5`` searches the defaults of half size.
+`DIR` has ``kitti2015`` and ``middlebury/{2003/cones, 2003/teddy, 2014/Motorcycle}``. Rows are appended to the CSV one
+by one; options that are in it are not run again. ``--scale 0.5`` searches the defaults of half size.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from stereokit import Matcher
 from stereokit.defaults import METHODS
 from stereokit.methods import parse_method
-from stereokit_evaluation.data.datasets import Frame, kitti2015, middlebury, select
+from stereokit_evaluation.data.datasets import Frame, kitti2015, middlebury, select_frames
 from stereokit_evaluation.scoring.runner import run
 
 __all__ = ["main", "settings"]
@@ -65,7 +65,7 @@ def settings(method: str, scale: float = 1) -> Iterator[dict[str, Any]]:
     yield base
     name = parse_method(method)
     cost, aggregation = name.split("+")
-    for group in (_COMMON, _STAGES[cost], _STAGES[aggregation], _STAGES.get(name, {})):
+    for group in (_COMMON, *(_STAGES.get(part, {}) for part in (cost, aggregation, name))):
         for option, values in group.items():
             for value in values:
                 yield {**base, option: value}
@@ -89,7 +89,7 @@ def _bad_2(frame: Frame, method: str, options: dict[str, Any]) -> float:
 
 def _row(method: str, options: dict[str, Any], kitti: list[Frame], scenes: dict[str, Frame]) -> dict[str, Any]:
     matcher = Matcher(method, **options)
-    tuning, validation = (_d1(select(kitti, part), matcher) for part in (TUNING, VALIDATION))
+    tuning, validation = (_d1(select_frames(kitti, part), matcher) for part in (TUNING, VALIDATION))
     parts = (tuning, validation, (tuning[0] + validation[0], tuning[1] + validation[1]))
     shares = [f"{100 * errors / pixels:.2f}" for errors, pixels in parts]
     bad = [f"{_bad_2(scenes[name], method, options):.2f}" for name in SCENES]
@@ -103,19 +103,19 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--method", choices=sorted(METHODS), action="append", help="default: all four")
     parser.add_argument("--scale", type=float, choices=(1, 0.5), default=1, help="0.5: at half size, upscaled")
     parser.add_argument("--output", type=Path, required=True, help="CSV that rows are appended to")
-    given = parser.parse_args(argv)
-    kitti = kitti2015(given.data / "kitti2015")
-    scenes = {frame.name.split("/")[-1]: frame for frame in middlebury(given.data / "middlebury")}
+    arguments = parser.parse_args(argv)
+    kitti = kitti2015(arguments.data / "kitti2015")
+    scenes = {frame.name.split("/")[-1]: frame for frame in middlebury(arguments.data / "middlebury")}
     done = set()
-    if given.output.exists():
-        with given.output.open(newline="") as file:
+    if arguments.output.exists():
+        with arguments.output.open(newline="") as file:
             done = {(row["method"], row["options"]) for row in csv.DictReader(file)}
-    with given.output.open("a", newline="") as file:
+    with arguments.output.open("a", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         if not done:
             writer.writeheader()
-        for method in given.method or sorted(METHODS):
-            for options in settings(method, given.scale):
+        for method in arguments.method or sorted(METHODS):
+            for options in settings(method, arguments.scale):
                 if (method, json.dumps(options)) in done:
                     continue
                 row = _row(method, options, kitti, scenes)

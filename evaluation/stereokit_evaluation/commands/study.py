@@ -1,8 +1,8 @@
 """The command ``stereokit study``: the paper's robustness study, on KITTI 2015 or on the built-in scenes.
 
-Four matchers times the settings Mini+Linear, Original, Mini+CNN and Mini+StereoVAE, scored as KITTI 2015 does, with
-the published figures beside ours; a table, JSON, and a report to look at. Results are kept by frame and
-configuration (`stereokit_evaluation.study.store`), so that an interrupted run goes on where it ended.
+Four matchers in the variants Mini+Linear, Original, Mini+CNN and Mini+StereoVAE, scored as in KITTI 2015, with our
+figures and the published ones; a table, JSON, and a report. Results are stored by frame and configuration
+(`stereokit_evaluation.study.store`), so that an interrupted run resumes where it ended.
 """
 
 from __future__ import annotations
@@ -19,17 +19,16 @@ from stereokit.cli.options import DeviceOption, JsonOption, WeightsOption, check
 from stereokit.errors import OptionError
 from stereokit.io import check_output
 from stereokit.kernels.threads import available_threads
-from stereokit_evaluation.bench.peers import HH, THREE_WAY, opencv_threads
-from stereokit_evaluation.bench.table import load as system_load
-from stereokit_evaluation.bench.table import machine, versions
+from stereokit_evaluation.bench.baselines import HH, THREE_WAY, opencv_threads
+from stereokit_evaluation.bench.table import machine, system_load, versions
 from stereokit_evaluation.common.folders import check_folder, make_folder
 from stereokit_evaluation.common.progress import progress
-from stereokit_evaluation.data.datasets import load, select
+from stereokit_evaluation.data.datasets import dataset_names, load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.data.published import PAPER
 from stereokit_evaluation.data.splits import comparison, count_frames, split
 from stereokit_evaluation.scoring.runner import seen_in_training
-from stereokit_evaluation.study.configurations import build, parse_setting, peer, settings_at_hand
+from stereokit_evaluation.study.configurations import available_variants, baseline, build, parse_variant
 from stereokit_evaluation.study.run import Study, run_study
 from stereokit_evaluation.study.store import Store
 from stereokit_evaluation.study.table import as_json, print_tables
@@ -41,16 +40,17 @@ _DEFAULT_DISPARITIES = 128
 
 
 def study(
-    dataset: Annotated[str, typer.Option(help="kitti2015, scenes, or another data set of evaluate.")] = "scenes",
+    dataset: Annotated[str, typer.Option(help=f"One of {', '.join(dataset_names())}.")] = "scenes",
     root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
-    which: Annotated[
+    split_name: Annotated[
         str | None,
         typer.Option("--split", help="Of kitti2015: all, train or validation; default what can be scored."),
     ] = None,
     frames: Annotated[str | None, typer.Option(help="Numbers or names, such as 0-3,34-40.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,
-    setting: Annotated[
-        list[str] | None, typer.Option(help="original, linear, cnn, stereovae or a refiner; may repeat.")
+    variant: Annotated[
+        list[str] | None,
+        typer.Option("--variant", "--setting", help="original, linear, cnn, stereovae or a refiner; may repeat."),
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage; may repeat.")
@@ -61,78 +61,86 @@ def study(
     threads: Annotated[int | None, typer.Option(help="Threads of the matchers.")] = None,
     device: DeviceOption = "auto",
     repeats: Annotated[int, typer.Option(help="Timed calls for each frame; the median counts.")] = 3,
-    with_peers: Annotated[bool, typer.Option("--peers/--no-peers", help="OpenCV's modes too.")] = True,
+    with_baselines: Annotated[
+        bool, typer.Option("--baselines/--no-baselines", "--peers/--no-peers", help="OpenCV's modes too.")
+    ] = True,
     train: Annotated[bool, typer.Option("--train", help="Train each refiner for each matcher first.")] = False,
     train_settings: Annotated[
         list[str] | None, typer.Option("--train-set", metavar="KEY=VALUE", help="Setting of the training; may repeat.")
     ] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Results are kept here; a later run goes on.")
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the results; a later run resumes.")
     ] = Path("study"),
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html to the folder.")] = True,
-    show: Annotated[int, typer.Option(help="Frames to look at in the report.")] = 3,
+    show: Annotated[int, typer.Option(help="Frames in the report's viewer.")] = 3,
     json_file: JsonOption = None,
 ) -> None:
-    """Run the robustness study: S1 to S4 with every refiner, beside the published figures.
+    """Run the robustness study: S1 to S4 with every refiner, and the published figures.
 
     Frames that cannot be read are named on standard error and left out; the exit status is then 1. An interrupted
-    run keeps what it has: the same command goes on.
+    run has its results so far in the folder: the same command resumes.
     """
     check_json(json_file)
     check_folder(output)
     for name, value, least in (("repeats", repeats, 1), ("show", show, 0)):
         if value < least:
             raise OptionError(f"{name} must be at least {least}, got {value}")
-    if which is not None and dataset != "kitti2015":
+    if split_name is not None and dataset != "kitti2015":
         raise OptionError(f"split must go with dataset kitti2015, got {dataset!r}")
-    chosen, part, warnings = _frames(dataset, root, which, frames, count)
-    suggested = max((f.max_disparity for f in chosen if f.max_disparity is not None), default=_DEFAULT_DISPARITIES)
+    selected, part, warnings = _frames(dataset, root, split_name, frames, count)
+    suggested = max((f.max_disparity for f in selected if f.max_disparity is not None), default=_DEFAULT_DISPARITIES)
     levels = suggested if max_disparity is None else max_disparity
     options = {"max_disparity": levels, "threads": threads, "device": device, **parse_settings(settings or ())}
     options |= {} if weights is None else {"weights": weights}
-    methods, wanted = method or list(METHODS), [parse_setting(name) for name in setting or settings_at_hand()]
+    methods, variants = method or list(METHODS), [parse_variant(name) for name in variant or available_variants()]
     if train_settings and not train:
         raise OptionError(f"train-set must go with train, got {train_settings[0]!r} alone")
     names = [cell.method for cell in build(methods, ["original"], {"max_disparity": levels, "device": device})]
     trained: dict[tuple[str, str], str] = {}
     training: dict[str, Any] | None = None
     if train:
-        learners = [name for name in wanted if name in per_matcher.TRAINED]
-        given = per_matcher.training_frames(dataset, root, chosen)
-        training = {"frames": [frame.name for frame in given], "settings": train_settings or [], "refiners": learners}
-        for name, refiner in itertools.product(names, learners):
+        refiners = [name for name in variants if name in per_matcher.TRAINED]
+        training_frames = per_matcher.training_frames(dataset, root, selected)
+        training = {
+            "frames": [frame.name for frame in training_frames],
+            "settings": train_settings or [],
+            "refiners": refiners,
+        }
+        for name, refiner in itertools.product(names, refiners):
             typer.echo(f"training {refiner} for {name}", err=True)
             trained[name, refiner] = per_matcher.retrain(
-                name, refiner, given, output / "trained", dataset=dataset, root=root, max_disparity=levels,
+                name, refiner, training_frames, output / "trained", dataset=dataset, root=root, max_disparity=levels,
                 settings=train_settings or (),
             )  # fmt: skip
-    configurations = build(methods, wanted, options, trained)
-    seen = (seen_in_training(c.matcher, dataset, chosen) for c in configurations)
-    warnings += dict.fromkeys(line for line in seen if line is not None)
-    if with_peers:
-        configurations += [peer(key, levels) for key in (THREE_WAY, HH)]
-    about = machine(system_load())
-    timing = {"threads": threads or available_threads(), "cpu": about["cpu"]}
-    steps = len(chosen) * len(configurations)
+    configurations = build(methods, variants, options, trained)
+    notes = (seen_in_training(c.matcher, dataset, selected) for c in configurations)
+    warnings += dict.fromkeys(line for line in notes if line is not None)
+    if with_baselines:
+        configurations += [baseline(key, levels) for key in (THREE_WAY, HH)]
+    machine_info = machine(system_load())
+    timing = {"threads": threads or available_threads(), "cpu": machine_info["cpu"]}
+    steps = len(selected) * len(configurations)
     with opencv_threads(timing["threads"]), progress(steps) as (console, step):
 
-        def tell(line: str) -> None:
+        def print_line(line: str) -> None:
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
         for line in warnings:
-            tell(f"warning: {line}")
+            print_line(f"warning: {line}")
         store = Store(make_folder(output / "results"))
-        found = run_study(chosen, configurations, store, repeats=repeats, about_times=timing, step=step, tell=tell)
-        if found.interrupted:
-            tell("interrupted: the figures cover the frames done so far; the same command goes on")
-    scored = {frame.name for row in found.rows for frame in row.result.frames}
-    used = [frame for frame in chosen if frame.name in scored]
+        result = run_study(
+            selected, configurations, store, repeats=repeats, about_times=timing, step=step, report=print_line
+        )
+        if result.interrupted:
+            print_line("interrupted: the figures cover the frames done so far; the same command goes on")
+    scored = {frame.name for row in result.rows for frame in row.result.frames}
+    used = [frame for frame in selected if frame.name in scored]
     document = {
-        **as_json(found),
+        **as_json(result),
         "dataset": dataset,
         "split": part,
         "frames": [frame.name for frame in used],
-        "frames_with_truth": _with_truth(found),
+        "frames_with_truth": _with_truth(result),
         "comparison": comparison(dataset, used),
         "source_of_published": PAPER,
         "warnings": warnings,
@@ -140,34 +148,34 @@ def study(
         "training": training,
         "version": __version__,
         "versions": versions(),
-        "machine": about,
+        "machine": machine_info,
     }
     if not write_json(json_file, document):
         counts = document["frames_with_truth"]
         heading = f"{dataset}{'' if part is None else ', ' + part}, {count_frames(used)} (noc {counts['noc']}, "
         heading += f"occ {counts['occ']}, with objects {counts['objects']})"
-        print_tables(heading, found, document["comparison"])
+        print_tables(heading, result, document["comparison"])
     if report and used:
-        _report(output / "report.html", document, found, used, show, print_path=str(json_file) != "-")
-    _exit(found, explicit=setting is not None)
+        _report(output / "report.html", document, result, used, show, print_path=str(json_file) != "-")
+    _exit(result, explicit=variant is not None)
 
 
 def _frames(
-    dataset: str, root: Path | None, which: str | None, frames: str | None, count: int
+    dataset: str, root: Path | None, split_name: str | None, frames: str | None, count: int
 ) -> tuple[list[Frame], str | None, list[str]]:
     """Return the frames, the name of the split, and warnings."""
-    every = load(dataset, root, count=count)
+    all_frames = load_frames(dataset, root, count=count)
     if dataset == "scenes":
-        every[0].load_left()  # the package that draws them is there, or this says that it is not
+        all_frames[0].load_left()  # fails here if the package that draws them is missing
     if dataset != "kitti2015":
-        return select(every, frames), None, []
-    part, every, warning = split(every, which)
-    return select(every, frames), part, [warning] if warning else []
+        return select_frames(all_frames, frames), None, []
+    part, all_frames, warning = split(all_frames, split_name)
+    return select_frames(all_frames, frames), part, [warning] if warning else []
 
 
-def _with_truth(found: Study) -> dict[str, int]:
-    """Return how many of the scored frames have which ground truth: D1 columns cover different frames."""
-    scores = next((row.result.frames for row in found.rows if row.result.frames), ())
+def _with_truth(result: Study) -> dict[str, int]:
+    """Return the numbers of scored frames by kind of ground truth: D1 columns cover different frames."""
+    scores = next((row.result.frames for row in result.rows if row.result.frames), ())
     return {
         "noc": sum(frame.score.noc.all.filled.pixels > 0 for frame in scores),
         "occ": sum(frame.score.occ.all.filled.pixels > 0 for frame in scores),
@@ -176,7 +184,7 @@ def _with_truth(found: Study) -> dict[str, int]:
 
 
 def _report(
-    path: Path, document: dict[str, Any], found: Study, frames: list[Frame], show: int, print_path: bool
+    path: Path, document: dict[str, Any], result: Study, frames: list[Frame], show: int, print_path: bool
 ) -> None:
     absent = [name for name in ("plotly", "jinja2") if find_spec(name) is None]
     if absent:
@@ -185,13 +193,13 @@ def _report(
     from stereokit_evaluation.report.page import write_report
 
     check_output(path, name="report")
-    size = write_report(path, document, found, frames, show)
+    size = write_report(path, document, result, frames, show)
     if print_path:
         typer.echo(f"report: {path} ({size / 1e6:.1f} MB)")
 
 
-def _exit(found: Study, explicit: bool) -> None:
-    if found.interrupted:
+def _exit(result: Study, explicit: bool) -> None:
+    if result.interrupted:
         raise typer.Exit(130)
-    if found.skipped or (explicit and any(row.missing for row in found.rows)):
+    if result.skipped or (explicit and any(row.missing for row in result.rows)):
         raise typer.Exit(1)

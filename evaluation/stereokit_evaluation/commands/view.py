@@ -23,6 +23,7 @@ from stereokit.cli.options import (
     parse_settings,
     write_json,
 )
+from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, read_rig_option
 from stereokit.errors import InputError, OptionError
 from stereokit.io import check_output, read_disparity, read_pair, write_bytes
 from stereokit_evaluation.common.weights import check_weights, weights_option
@@ -50,33 +51,37 @@ def view(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Option of a stage; may repeat.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Middlebury, KITTI or JSON calibration, for metres.")
+        Path | None, typer.Option(metavar="FILE", help="Calibration of a rectified pair, for metres.")
     ] = None,
     cameras: Annotated[tuple[int, int], typer.Option(help="Camera pair of a KITTI calibration.")] = (2, 3),
+    rig: RigOption = None,
+    alpha: AlphaOption = None,
     truth: Annotated[Path | None, typer.Option(metavar="FILE", help="True disparity, for errors.")] = None,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Match LEFT and RIGHT and write a page to look at: image, disparity, error, point cloud.
+    """Match LEFT and RIGHT and write a page with image, disparity, error and point cloud.
 
-    Without a calibration there is no depth, and the point cloud is in pixels.
+    Without a calibration there is no depth, and the point cloud is in pixels. With --rig the images are raw ones, and
+    are rectified first.
     """
     check_output(output, (".html", ".htm"), "output")
     check_json(json_file)
     require("jinja2")
     if refiner and scale == 1:
         raise OptionError(f"refiner needs --scale 0.5, got {', '.join(refiner)} with scale 1")
+    check_rig_options(rig, alpha, calibration)
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
     options |= {"threads": threads, "device": device, **parse_settings(settings or ())}
     names = list(dict.fromkeys(method or ["S2"]))
     check_weights(refiner or (), weights)
     refiners: list[str | None] = [*refiner] if refiner else [None]
     matchers = {
-        f"{name} {title(refine or 'linear') if scale != 1 else ''}".strip(): Matcher(
-            name, refiner=refine, **options, **weights_option(refine, weights)
+        f"{name} {title(refiner_name or 'linear') if scale != 1 else ''}".strip(): Matcher(
+            name, refiner=refiner_name, **options, **weights_option(refiner_name, weights)
         )
         for name in names
-        for refine in refiners
+        for refiner_name in refiners
     }
     images = read_pair(left, right)
     if images[0].shape != images[1].shape:
@@ -84,21 +89,25 @@ def view(
         raise InputError(f"LEFT and RIGHT must have the same size and number of channels, got {sizes}")
     size = images[0].shape[1], images[0].shape[0]
     camera = None if calibration is None else read_calibration(calibration, cameras, size)
-    known = None if truth is None else read_disparity(truth)
-    if known is not None and known.shape != images[0].shape[:2]:
-        raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {known.shape}")
+    masks: dict[str, Any] = {}
+    if rig is not None:
+        rectification = read_rig_option(rig, size).rectification(alpha=alpha)
+        images, masks, camera = rectification(*images), rectification.masks, rectification.calibration
+    true_disparity = None if truth is None else read_disparity(truth)
+    if true_disparity is not None and true_disparity.shape != images[0].shape[:2]:
+        raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {true_disparity.shape}")
     maps, seconds = [], {}
     for name, matcher in matchers.items():
-        matcher(*images)  # compiles, so that the time below is that of matching
-        begun = time.perf_counter()
-        found = matcher(*images)
-        seconds[name] = time.perf_counter() - begun
+        matcher(*images, **masks)  # compiles, so that the time below is that of matching
+        start = time.perf_counter()
+        result = matcher(*images, **masks)
+        seconds[name] = time.perf_counter() - start
         note = f"{1000 * seconds[name]:.0f} ms"
-        if known is not None:
-            d1 = score(found.disparity, occ=known, measured=found.valid).occ.all.filled.d1()
+        if true_disparity is not None:
+            d1 = score(result.disparity, occ=true_disparity, measured=result.valid).occ.all.filled.d1()
             note += "" if d1 is None else f", D1 {d1:.2f} %"
-        maps.append(viewer.Shown(name, found.disparity, found.valid, note))
-    pair = viewer.pair(left.name, images[0], maps, occ=known, calibration=camera)
+        maps.append(viewer.MethodMap(name, result.disparity, result.valid, note))
+    pair = viewer.pair(left.name, images[0], maps, occ=true_disparity, calibration=camera)
     page = render(
         "view.html.j2", [pair], title=_title(left, right), version=__version__,
         maps=maps, methods=[maps[0].name, maps[-1].name],
@@ -110,8 +119,8 @@ def view(
         "density": {shown.name: float(np.mean(shown.valid)) for shown in maps}, "version": __version__,
     }  # fmt: skip
     if not write_json(json_file, report):
-        without = "" if camera is not None else "; no calibration: no depth, and the point cloud is in pixels"
-        typer.echo(f"{output} ({len(page) / 1e6:.1f} MB){without}")
+        hint = "" if camera is not None else "; no calibration: no depth, and the point cloud is in pixels"
+        typer.echo(f"{output} ({len(page) / 1e6:.1f} MB){hint}")
     if open_browser:
         webbrowser.open(output.resolve().as_uri())
 

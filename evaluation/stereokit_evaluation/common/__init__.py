@@ -1,1 +1,1 @@
-"""What several rooms use: progress, folders, sizes, versions."""
+"""Common parts of several packages: progress, folders, sizes, versions."""

@@ -13,9 +13,9 @@ __all__ = ["versions"]
 
 def versions(others: Iterable[str] = ()) -> dict[str, str | None]:
     """Return the versions of this package and of those that it computes with, and of `others` that are installed."""
-    found: dict[str, str | None] = {name: _version(name) for name in ("stereokit", "numba", "numpy")}
-    found |= {"opencv": cv2.__version__, "python": platform.python_version()}
-    return found | {name: _version(name) for name in sorted(others) if _version(name)}
+    core: dict[str, str | None] = {name: _version(name) for name in ("stereokit", "numba", "numpy")}
+    core |= {"opencv": cv2.__version__, "python": platform.python_version()}
+    return core | {name: _version(name) for name in sorted(others) if _version(name)}
 
 
 def _version(package: str) -> str | None:

@@ -1,4 +1,4 @@
-"""Digests of source files, for the names of what they made: a file of older code is then never taken for a new one."""
+"""Digests of source files, for the names of cached files: a file of older code is then never taken for a new one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["fingerprint"]
 
 
 def fingerprint(sources: Iterable[Path]) -> str:
-    """Return a digest of files' contents, in the order given, 12 letters."""
+    """Return a digest of the contents of files, in their order, 12 hexadecimal digits."""
     digest = hashlib.sha256()
     for path in sources:
         digest.update(path.read_bytes())

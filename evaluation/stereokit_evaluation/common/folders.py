@@ -1,4 +1,4 @@
-"""Folders that commands write to: refused before any work is done, made when they are needed."""
+"""Output folders of commands: checked before any work, created when they are needed."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from stereokit.errors import FileError
 __all__ = ["check_folder", "make_folder"]
 
 
-def check_folder(place: Path, name: str = "output") -> None:
-    """Refuse a place that can never be a folder, because a file stands in the way.
+def check_folder(path: Path, name: str = "output") -> None:
+    """Refuse a path that can never be a folder, because a part of it is a file.
 
     Raises
     ------
     FileError
-        With `name`, what the message calls the argument.
+        With `name`, the argument's name in the message.
     """
-    nearest = next(above for above in (place, *place.absolute().parents) if above.exists())
+    nearest = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not nearest.is_dir():
-        raise FileError(f"{name} must be a folder, got {str(place)!r} ({str(nearest)!r} is a file)")
+        raise FileError(f"{name} must be a folder, got {str(path)!r} ({str(nearest)!r} is a file)")
 
 
-def make_folder(place: Path, name: str = "output") -> Path:
-    """Make a folder, unless it is there, and return it.
+def make_folder(path: Path, name: str = "output") -> Path:
+    """Create a folder, unless it exists, and return it.
 
     Raises
     ------
     FileError
-        If it cannot be made.
+        If it cannot be created.
     """
-    io.make_folder(name, place)
-    return place
+    io.make_folder(name, path)
+    return path

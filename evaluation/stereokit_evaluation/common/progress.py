@@ -1,4 +1,4 @@
-"""A progress bar for commands that take times: it is drawn between the timed calls only, never during one."""
+"""A progress bar for commands that measure times: it is drawn between the timed calls only, never during one."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def progress(total: int | None) -> Iterator[tuple[Console, Callable[..., None]]]
     Parameters
     ----------
     total : int or None
-        Steps of the whole work, None where that is not known.
+        Number of steps, None where it is unknown.
 
     Yields
     ------
     console : Console
         Writes to standard error, above the bar.
     step : callable
-        ``step(text, advance=1)`` says what was done.
+        ``step(text, advance=1)`` reports a finished step.
     """
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

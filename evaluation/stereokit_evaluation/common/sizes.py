@@ -1,4 +1,4 @@
-"""The sizes and numbers of threads that the command ``bench`` is given."""
+"""The sizes and numbers of threads of the command ``bench``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stereokit.errors import OptionError
 
 __all__ = ["SIZES", "Size", "parse_sizes", "parse_threads"]
 
-_MOST_LEVELS = 2048
+_MAX_LEVELS = 2048
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def parse_sizes(text: str) -> list[Size]:
     OptionError
         If one is neither known nor ``WxHxD``, or has no more columns than levels.
     """
-    found: list[Size] = []
+    sizes: list[Size] = []
     for word in (part.strip() for part in text.split(",")):
         numbers = re.fullmatch(r"(\d{1,6})x(\d{1,6})x(\d{1,6})", word.lower())
         if word.upper() in SIZES:
@@ -47,14 +47,14 @@ def parse_sizes(text: str) -> list[Size]:
         elif numbers:
             width, height, levels = (int(number) for number in numbers.groups())
             size = Size(f"{width}x{height}x{levels}", width, height, levels)
-            if height < 1 or not 2 <= levels <= _MOST_LEVELS or width <= levels:
+            if height < 1 or not 2 <= levels <= _MAX_LEVELS or width <= levels:
                 raise OptionError(
-                    f"sizes must be WxHxD with H of 1 or more, D from 2 to {_MOST_LEVELS} and W above D, got {word!r}"
+                    f"sizes must be WxHxD with H of 1 or more, D from 2 to {_MAX_LEVELS} and W above D, got {word!r}"
                 )
         else:
             raise OptionError(f"sizes must be K, M, H or WxHxD such as 640x480x64, with commas, got {word!r}")
-        found.append(size)
-    return list(dict.fromkeys(found))
+        sizes.append(size)
+    return list(dict.fromkeys(sizes))
 
 
 def parse_threads(text: str) -> list[int]:

@@ -1,9 +1,8 @@
-"""Stereo data sets as lists of frames that load when asked.
+"""Stereo data sets as lists of frames that load on demand.
 
-Each function reads one published layout, or one of our own, and returns frames sorted by name. Nothing but
-file names is read until a frame's ``load_`` method is called, so that a broken file costs one frame and not
-the run. Ground truth comes in two kinds, as in KITTI: *noc*, the pixels that both cameras see, and *occ*, all
-pixels.
+Each function reads one published layout, or one of our own, and returns frames sorted by name. Only file names
+are read until a frame's ``load_`` method is called, so that a broken file costs one frame and not the run. Ground
+truth comes in two kinds, as in KITTI: *noc*, the pixels that both cameras see, and *occ*, all pixels.
 """
 
 from __future__ import annotations
@@ -21,19 +20,21 @@ from numpy.typing import NDArray
 from stereokit.calibration import Calibration, read_calibration
 from stereokit.errors import FileError, OptionError, UnknownNameError, did_you_mean
 from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES, read_disparity, read_image, read_text
-from stereokit_evaluation.data.frame import Frame, Loader, select
+from stereokit_evaluation.data.frame import Frame, Loader, select_frames
 
 __all__ = [
     "DATASETS",
     "Frame",
+    "data_set",
+    "dataset_names",
     "eth3d",
     "folder",
     "kitti2012",
     "kitti2015",
-    "load",
+    "load_frames",
     "middlebury",
     "scenes",
-    "select",
+    "select_frames",
 ]
 
 _KITTI_DISPARITIES = 128  # the study's D; a few pixels of the ground truth lie beyond
@@ -43,31 +44,43 @@ _SCENE_SIZE = (640, 384)  # width, height
 _MAPS = (*DISPARITY_SUFFIXES, ".tif")
 
 
+DATASETS: dict[str, Callable[[str | Path], list[Frame]]] = {}
+"""The data sets that live in a folder, by the names that the command line uses."""
+
+
+def data_set(function: Callable[[str | Path], list[Frame]]) -> Callable[[str | Path], list[Frame]]:
+    """File a function among `DATASETS` under its own name."""
+    DATASETS[function.__name__] = function
+    return function
+
+
+@data_set
 def kitti2015(root: str | Path) -> list[Frame]:
     """Return the frames of KITTI 2015: ``image_2``, ``image_3``, ``disp_noc_0``, ``disp_occ_0``, ``obj_map``.
 
     Parameters
     ----------
     root : str or Path
-        The folder that holds ``training``, or ``training`` itself. Only the first pair of each frame,
-        ``*_10``.
+        The folder of ``training``, or ``training`` itself. Only the first pair of each frame, ``*_10``.
     """
     return _kitti("KITTI 2015", root, [("image_2", "image_3")], ("disp_noc_0", "disp_occ_0", "obj_map"))
 
 
+@data_set
 def kitti2012(root: str | Path) -> list[Frame]:
     """Return the frames of KITTI 2012: ``image_0``, ``image_1``, ``disp_noc`` and ``disp_occ``.
 
     Parameters
     ----------
     root : str or Path
-        The folder that holds ``training``, or ``training`` itself. ``colored_0/1`` or ``colour_0/1`` serve
-        where there is no ``image_0``.
+        The folder of ``training``, or ``training`` itself. ``colored_0/1`` or ``colour_0/1`` serve where there
+        is no ``image_0``.
     """
     pairs = [("image_0", "image_1"), ("colored_0", "colored_1"), ("colour_0", "colour_1")]
     return _kitti("KITTI 2012", root, pairs, ("disp_noc", "disp_occ", "obj_map"))
 
 
+@data_set
 def middlebury(root: str | Path) -> list[Frame]:
     """Return the Middlebury pairs in any folder at or below `root`, named by their folder.
 
@@ -87,38 +100,42 @@ def middlebury(root: str | Path) -> list[Frame]:
             frames.append(_scaled(base, "2003" if modern else "2001", path, "im6", "disp2"))
         elif path.stem == "view1":
             frames.append(_scaled(base, "2006", path, "view5", "disp1"))
-    wanted = "folders with im0.png, im1.png, disp0GT.pfm or im2, im6, disp2 or view1, view5, disp1"
-    return _found("Middlebury", frames, base, wanted)
+    layouts = "folders with im0.png, im1.png, disp0GT.pfm or im2, im6, disp2 or view1, view5, disp1"
+    return _sorted_frames("Middlebury", frames, base, layouts)
 
 
+@data_set
 def eth3d(root: str | Path) -> list[Frame]:
     """Return the ETH3D pairs below `root`: ``im0.png``, ``im1.png``, ``disp0GT.pfm``, ``mask0nocc.png``."""
     base = _root(root)
-    return _found("ETH3D", [*_with_calibration(base)], base, "folders with im0.png, im1.png, disp0GT.pfm")
+    return _sorted_frames("ETH3D", [*_with_calibration(base)], base, "folders with im0.png, im1.png, disp0GT.pfm")
 
 
+@data_set
 def folder(root: str | Path) -> list[Frame]:
     """Return the pairs of a plain folder: ``left/NAME`` and ``right/NAME``, matched without extension.
 
     Ground truth, where there is any, lies in ``disp_noc`` and ``disp_occ``; ``disparity`` is another name of
-    the latter, and ``obj_map`` holds object maps. Disparities are 16-bit KITTI PNG, PFM, NPY or TIFF.
+    the latter, and object maps lie in ``obj_map``. Disparities are 16-bit KITTI PNG, PFM, NPY or TIFF.
     """
     base = _root(root)
-    left, right = _stems(base / "left", READABLE_SUFFIXES), _stems(base / "right", READABLE_SUFFIXES)
+    lefts, rights = _stems(base / "left", READABLE_SUFFIXES), _stems(base / "right", READABLE_SUFFIXES)
     noc, objects = _stems(base / "disp_noc", _MAPS), _stems(base / "obj_map", READABLE_SUFFIXES)
     occ = {**_stems(base / "disparity", _MAPS), **_stems(base / "disp_occ", _MAPS)}
     frames = [
         Frame(
             name,
-            left.get(name, base / "left" / f"{name}.png"),
-            right.get(name, base / "right" / f"{name}.png"),
+            lefts.get(name, base / "left" / f"{name}.png"),
+            rights.get(name, base / "right" / f"{name}.png"),
             noc=_lazy(read_disparity, noc.get(name)),
             occ=_lazy(read_disparity, occ.get(name)),
             objects=_lazy(read_image, objects.get(name)),
         )
-        for name in left.keys() | right.keys() | noc.keys() | occ.keys()
+        for name in lefts.keys() | rights.keys() | noc.keys() | occ.keys()
     ]
-    return _found("plain", frames, base, "left/NAME.png, right/NAME.png, disparity/NAME.png (or .pfm, .npy, .tiff)")
+    return _sorted_frames(
+        "plain", frames, base, "left/NAME.png, right/NAME.png, disparity/NAME.png (or .pfm, .npy, .tiff)"
+    )
 
 
 def scenes(count: int = 20) -> list[Frame]:
@@ -132,34 +149,29 @@ def scenes(count: int = 20) -> list[Frame]:
     if count < 1:
         raise OptionError(f"count must be at least 1, got {count}")
 
-    def part(index: int, take: Callable[[Any], NDArray[Any]]) -> Loader:
-        return lambda: take(_scene(index))
+    def loader(index: int, choose: Callable[[Any], NDArray[Any]]) -> Loader:
+        return lambda: choose(_scene(index))
 
     return [
         Frame(
             f"scene_{index:03d}",
-            part(index, lambda scene: scene.left),
-            part(index, lambda scene: scene.right),
-            noc=part(index, lambda scene: scene.noc),
-            occ=part(index, lambda scene: scene.occ),
-            objects=part(index, lambda scene: scene.objects),
+            loader(index, lambda scene: scene.left),
+            loader(index, lambda scene: scene.right),
+            noc=loader(index, lambda scene: scene.noc),
+            occ=loader(index, lambda scene: scene.occ),
+            objects=loader(index, lambda scene: scene.objects),
             calibration=partial(_scene_calibration, index),
         )
         for index in range(count)
     ]
 
 
-DATASETS: dict[str, Callable[[str | Path], list[Frame]]] = {
-    "kitti2015": kitti2015,
-    "kitti2012": kitti2012,
-    "middlebury": middlebury,
-    "eth3d": eth3d,
-    "folder": folder,
-}
-"""The data sets that live in a folder, by the names that the command line uses."""
+def dataset_names() -> list[str]:
+    """Return the names of all data sets, those of `DATASETS` and ``"scenes"``."""
+    return [*DATASETS, "scenes"]
 
 
-def load(dataset: str, root: str | Path | None = None, *, count: int = 20) -> list[Frame]:
+def load_frames(dataset: str, root: str | Path | None = None, *, count: int = 20) -> list[Frame]:
     """Return the frames of a data set by its name.
 
     Parameters
@@ -169,17 +181,17 @@ def load(dataset: str, root: str | Path | None = None, *, count: int = 20) -> li
     root : str or Path, optional
         Its folder; ``scenes`` needs none.
     count : int
-        Frames to make, for ``scenes``.
+        Number of frames of ``scenes``.
 
     Raises
     ------
     UnknownNameError, OptionError, FileError
-        If there is no such data set, `root` is not given, or holds none of its frames.
+        If there is no such data set, or `root` is missing or has none of its frames.
     """
     if dataset == "scenes":
         return scenes(count)
     if dataset not in DATASETS:
-        raise UnknownNameError(did_you_mean("data set", dataset, [*DATASETS, "scenes"]))
+        raise UnknownNameError(did_you_mean("data set", dataset, dataset_names()))
     if root is None:
         raise OptionError(f"root must name the folder of data set {dataset!r}, got none")
     return DATASETS[dataset](root)
@@ -187,7 +199,7 @@ def load(dataset: str, root: str | Path | None = None, *, count: int = 20) -> li
 
 @lru_cache(maxsize=2)
 def _scene(index: int) -> Any:
-    """Draw a scene once for its images and maps, which are asked for one after the other."""
+    """Draw a scene once for its images and maps, which are read one after the other."""
     return import_module("stereokit_evaluation.synthetic.scenes").generate(index, *_SCENE_SIZE)
 
 
@@ -198,11 +210,11 @@ def _scene_calibration(index: int) -> Calibration:
 
 
 def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth: Sequence[str]) -> list[Frame]:
-    given = _root(root)
-    base = given / "training" if (given / "training").is_dir() else given
+    top = _root(root)
+    base = top / "training" if (top / "training").is_dir() else top
     a, b = next((pair for pair in pairs if (base / pair[0]).is_dir()), pairs[0])
     noc, occ, objects = (base / part for part in truth)
-    # A frame of which any part is there is listed, so that the parts that are missing are reported.
+    # A frame with any existing part is listed, so that its missing parts are reported.
     names = {path.stem for part in (base / a, base / b, noc, occ) for path in part.glob("*_10.png")}
     frames = [
         Frame(
@@ -218,7 +230,7 @@ def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth
         for name in names
     ]
     wanted = f"[training/]{a}/*_10.png, {b}/*_10.png, {truth[0]}/*_10.png, {truth[1]}/*_10.png"
-    return _found(title, frames, given, wanted)
+    return _sorted_frames(title, frames, top, wanted)
 
 
 def _kitti_calibration(base: Path, name: str, cameras: tuple[int, int]) -> Callable[[], Calibration] | None:
@@ -229,7 +241,7 @@ def _kitti_calibration(base: Path, name: str, cameras: tuple[int, int]) -> Calla
 
 
 def _with_calibration(base: Path) -> Iterator[Frame]:
-    """Yield the pairs that are laid out as Middlebury does since 2014, and ETH3D."""
+    """Yield the pairs in the layout of Middlebury since 2014 and of ETH3D."""
     for left in _images_below(base):
         scene = left.parent
         if left.name != "im0.png" or _sibling(scene, "im2"):  # the scenes of 2001 hold im0 to im8
@@ -250,9 +262,9 @@ def _with_calibration(base: Path) -> Iterator[Frame]:
 def _scaled(base: Path, layout: str, left: Path, right: str, truth: str) -> Frame:
     """Return a pair whose disparity is an 8-bit image with several levels a pixel."""
     scene = left.parent
-    found, mask = _sibling(scene, truth), _sibling(scene, "mask_nonocc")
+    truth_path, mask = _sibling(scene, truth), _sibling(scene, "mask_nonocc")
     levels = _LEVELS[layout]
-    occ = None if found is None else partial(_levels, found, levels, _WIDEST[layout])
+    occ = None if truth_path is None else partial(_levels, truth_path, levels, _WIDEST[layout])
     return Frame(
         _name(base, scene),
         left,
@@ -275,7 +287,7 @@ def _levels(path: Path, levels: int, widest: int) -> NDArray[np.float32]:
 
 
 def _masked(load_map: Loader, mask: Path) -> NDArray[np.float32]:
-    """Keep the disparity where the mask is white: seen by both cameras (grey: hidden from the right)."""
+    """Return the disparity where the mask is white, seen by both cameras (grey: hidden from the right), else NaN."""
     disparity, seen = load_map(), read_image(mask, gray=True)
     if seen.shape != disparity.shape:
         raise FileError(f"{mask} must have the size of its map, {disparity.shape}, got {seen.shape}")
@@ -283,10 +295,10 @@ def _masked(load_map: Loader, mask: Path) -> NDArray[np.float32]:
 
 
 def _ndisp(path: Path) -> int | None:
-    """Return the number of disparities that a calibration file bounds, None if it does not say."""
+    """Return ``ndisp``, the number of disparities, of a calibration file, None if it has none."""
     try:
         lines = read_text(path, "calibration").splitlines()
-    except FileError:  # told where the calibration itself is asked for
+    except FileError:  # reported when the calibration itself is read
         return None
     values = dict(line.strip().partition("=")[::2] for line in lines)
     text = re.fullmatch(r"\s*([1-9][0-9]{0,5})(?:\.0*)?\s*", values.get("ndisp", ""))
@@ -300,9 +312,9 @@ def _root(root: str | Path) -> Path:
     return base
 
 
-def _found(title: str, frames: list[Frame], root: Path, wanted: str) -> list[Frame]:
+def _sorted_frames(title: str, frames: list[Frame], root: Path, wanted: str) -> list[Frame]:
     if not frames:
-        raise FileError(f"root holds no {title} frames, got {str(root)!r}; expected {wanted}")
+        raise FileError(f"root has no {title} frames, got {str(root)!r}; expected {wanted}")
     return sorted(frames, key=lambda frame: frame.name)
 
 

@@ -1,4 +1,4 @@
-"""One stereo pair with its ground truth, loaded when asked, and the choice of pairs by name or number."""
+"""One stereo pair with its ground truth, loaded on demand, and the selection of pairs by name or number."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereokit.calibration import Calibration
 from stereokit.errors import OptionError
 from stereokit.io import read_image, read_pair
 
-__all__ = ["Frame", "Loader", "select"]
+__all__ = ["Frame", "Loader", "select_frames"]
 
 Loader = Callable[[], NDArray[Any]]
 """A function without arguments that returns an image or a map."""
@@ -24,7 +24,7 @@ Loader = Callable[[], NDArray[Any]]
 
 @dataclass(frozen=True)
 class Frame:
-    """One stereo pair and what is known about it.
+    """One stereo pair with its ground truth and calibration.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Frame:
         Functions that return the true disparity of the pixels that both cameras see, of all pixels, and the
         object map; None where there is none.
     max_disparity : int, optional
-        Disparities to search for this pair, None if the data set does not say.
+        Disparities to search for this pair, None if the data set has no number.
     calibration : callable, optional
         Function that returns the cameras' geometry; None where it is not known.
     """
@@ -51,7 +51,7 @@ class Frame:
     calibration: Callable[[], Calibration] | None = None
 
     def load_left(self, *, gray: bool = False) -> NDArray[Any]:
-        """Return the left image, (H, W) or (H, W, 3) RGB, in the type that it was stored in."""
+        """Return the left image, (H, W) or (H, W, 3) RGB, in its stored type."""
         return _image(self.left, gray)
 
     def load_right(self, *, gray: bool = False) -> NDArray[Any]:
@@ -81,8 +81,8 @@ class Frame:
         return None if self.calibration is None else self.calibration()
 
 
-def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:
-    """Return the frames that a list such as ``"0-3,34-40"`` or ``"cones,teddy"`` names, in their own order.
+def select_frames(frames: Iterable[Frame], selection: str | None) -> list[Frame]:
+    """Return the frames of a list such as ``"0-3,34-40"`` or ``"cones,teddy"``, in their own order.
 
     A part is the name of a frame (or the last part of it), or a number or range of numbers, both ends
     included, compared with the number at the end of the name; the ``_10`` of KITTI does not count.
@@ -92,22 +92,24 @@ def select(frames: Iterable[Frame], which: str | None) -> list[Frame]:
     OptionError
         If a part is empty, a range runs backwards, or a part matches no frame.
     """
-    everything = list(frames)
-    if which is None:
-        return everything
-    chosen: set[str] = set()
-    for part in (text.strip() for text in which.split(",")):
-        names = {f.name for f in everything if part and part in (f.name, f.name.rpartition("/")[2])}
-        if not names and (match := re.fullmatch(r"([0-9]{1,18})(?:-([0-9]{1,18}))?", part)):
+    all_frames = list(frames)
+    if selection is None:
+        return all_frames
+    names: set[str] = set()
+    for part in (text.strip() for text in selection.split(",")):
+        matches = {f.name for f in all_frames if part and part in (f.name, f.name.rpartition("/")[2])}
+        if not matches and (match := re.fullmatch(r"([0-9]{1,18})(?:-([0-9]{1,18}))?", part)):
             first, last = int(match[1]), int(match[2] or match[1])
             if last < first:
                 raise OptionError(f"frames must be ranges with the smaller number first, got {part!r}")
-            names = {f.name for f in everything if (n := _number(f.name)) is not None and first <= n <= last}
-        if not names:
-            known = ", ".join(f.name for f in everything[:3])
+            matches = {
+                f.name for f in all_frames if (number := _number(f.name)) is not None and first <= number <= last
+            }
+        if not matches:
+            known = ", ".join(f.name for f in all_frames[:3])
             raise OptionError(f"frames must be in the data set ({known} ...), got {part!r}")
-        chosen |= names
-    return [frame for frame in everything if frame.name in chosen]
+        names |= matches
+    return [frame for frame in all_frames if frame.name in names]
 
 
 def _number(name: str) -> int | None:

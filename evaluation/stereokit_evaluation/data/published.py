@@ -110,9 +110,9 @@ class Point:
     ms : float
         Milliseconds on a Jetson AGX Xavier.
     pixels : str
-        ``"occ"`` (all) or ``"noc"``, or ``""`` if no other source tells.
+        ``"occ"`` (all) or ``"noc"``, or ``""`` if no source names them.
     source : str
-        Where it stands.
+        The figure or page.
     """
 
     name: str
@@ -137,15 +137,15 @@ FIGURE_1 = (
 _AGX = {("S4", "original"): "ZNCC+SGM", ("S4", "cnn"): "Non-VAE NN", ("S4", "stereovae"): "StereoVAE"}
 
 
-def agx_ms(method: str, setting: str) -> float | None:
-    """Return table II's milliseconds on the AGX that stand beside one of our configurations, None if there are none.
+def agx_ms(method: str, variant: str) -> float | None:
+    """Return table II's milliseconds on the AGX for the same configuration as one of ours, None if it has none.
 
     Parameters
     ----------
     method : str
         ``"S1"`` to ``"S4"``.
-    setting : str
+    variant : str
         ``"linear"``, ``"original"``, ``"cnn"`` or ``"stereovae"``.
     """
-    row = _AGX.get((method, setting))
+    row = _AGX.get((method, variant))
     return None if row is None else TABLE_2[row]["AGX"]

@@ -42,7 +42,7 @@ def split(frames: Sequence[Frame], which: str | None) -> tuple[str, list[Frame],
     which : str
     chosen : list of Frame
     warning : str or None
-        How many frames are missing, in one line.
+        The number of missing frames, in one line.
 
     Raises
     ------
@@ -60,26 +60,30 @@ def split(frames: Sequence[Frame], which: str | None) -> tuple[str, list[Frame],
         which = "validation" if len(parts["validation"]) == VALIDATION_FRAMES else "all"
     chosen = parts[which]
     if not chosen:
-        there = ", ".join(f"{len(parts[name])} for {name}" for name in ("train", "validation"))
-        raise OptionError(f"split {which!r} must have frames with ground truth, got none (there are {there})")
-    lacking = _SIZES[which] - len(chosen)
-    if not lacking:
+        counts_text = ", ".join(f"{len(parts[name])} for {name}" for name in ("train", "validation"))
+        raise OptionError(f"split {which!r} must have frames with ground truth, got none (there are {counts_text})")
+    missing = _SIZES[which] - len(chosen)
+    if not missing:
         return which, chosen, None
     counts = [f"{_SIZES[name] - len(parts[name])} of the {_SIZES[name]} for {name}" for name in ("train", "validation")]
     detail = f" ({', '.join(counts)})" if which == "all" else ""
-    return which, chosen, f"{lacking} of {_SIZES[which]} frames of KITTI 2015 are missing{detail}"
+    return which, chosen, f"{missing} of {_SIZES[which]} frames of KITTI 2015 are missing{detail}"
 
 
 def count_frames(frames: Sequence[Frame]) -> str:
-    """Return how many frames there are, in words."""
+    """Return the number of frames as text, such as ``"2 frames"``."""
     return f"{len(frames)} frame{'' if len(frames) == 1 else 's'}"
 
 
 def comparison(dataset: str, frames: Sequence[Frame]) -> str:
-    """Return the line that says whether our figures and the published ones are of the same frames."""
-    theirs = f"the paper's {VALIDATION_FRAMES} validation frames (e4) and {TEST_FRAMES} test frames (e5) of KITTI 2015"
+    """Return a line about the frames of our scores and of the published ones: the same, or not."""
+    published = (
+        f"the paper's {VALIDATION_FRAMES} validation frames (e4) and {TEST_FRAMES} test frames (e5) of KITTI 2015"
+    )
     if dataset != "kitti2015":
-        return f"Not the same frames: published figures are of {theirs}, ours of {count_frames(frames)} of {dataset}."
+        return (
+            f"Not the same frames: published figures are of {published}, ours of {count_frames(frames)} of {dataset}."
+        )
     shared = sum(split_of(frame) == "validation" for frame in frames)
     if shared == len(frames) == VALIDATION_FRAMES:
         return (
@@ -87,6 +91,6 @@ def comparison(dataset: str, frames: Sequence[Frame]) -> str:
             f"not list them). Published e5 is of {TEST_FRAMES} other frames, the test server's."
         )
     return (
-        f"Not the same frames: published figures are of {theirs}, ours of {len(frames)} training frames, "
+        f"Not the same frames: published figures are of {published}, ours of {len(frames)} training frames, "
         f"{shared} of them among those {VALIDATION_FRAMES}."
     )

@@ -1,6 +1,6 @@
-"""The GPUs that `stereokit_evaluation.gpu_model.model` models, and published times beside the modelled ones.
+"""The GPUs that `stereokit_evaluation.gpu_model.model` models, and published times.
 
-Figures of the makers where there are any; what is assumed says so. The rates of the units are those of the CUDA C++
+Figures are the makers' where there are any; assumptions are marked. The rates of the units are those of the CUDA C++
 Programming Guide, "Throughput of Native Arithmetic Instructions", results per clock of a multiprocessor: 64 for integer
 arithmetic and multiplication, 16 for conversions and population counts, 32 for shuffles on compute capability 7.x to
 9.0, and 64 (7.x) or 128 (8.6 to 9.0) for floats.
@@ -25,7 +25,7 @@ class Machine:
     ----------
     name : str
     architecture : str
-        What code is assembled for.
+        Target of the assembled code.
     multiprocessors : int
     ghz : float
         Clock.
@@ -38,7 +38,7 @@ class Machine:
     launch_us : float
         Microseconds from launch to launch out of Python; assumed.
     source : str
-        Where the figures stand.
+        Source of the figures.
     """
 
     name: str
@@ -92,9 +92,9 @@ class Published:
     Attributes
     ----------
     name, machine : str
-        What ran on what.
+        The program and its GPU.
     size : str
-        As the source tells.
+        As in the source.
     ms : float
         Milliseconds of a pair.
     source : str
@@ -114,7 +114,7 @@ _LIBSGM = "github.com/fixstars/libSGM, README"
 _EMBEDDED = "Hernandez-Juarez et al., Embedded real-time stereo estimation via SGM on the GPU, ICCS 2016"
 
 PUBLISHED = (
-    Published("ZNCC+SGM of the paper", "AGX Xavier", "not told", TABLE_2["ZNCC+SGM"]["AGX"], f"{PAPER}, table II"),
+    Published("ZNCC+SGM of the paper", "AGX Xavier", "unknown", TABLE_2["ZNCC+SGM"]["AGX"], f"{PAPER}, table II"),
     Published("libSGM, 4 paths", "AGX Xavier", "1024x440, 128 levels", 9.0, _LIBSGM),
     Published("libSGM, 4 paths", "RTX 3080", "1024x440, 128 levels", 1.5, _LIBSGM),
     Published("Hernandez-Juarez, 4 paths", "Tegra X1", "640x480, 128 levels", 1e3 / 42, _EMBEDDED),
@@ -123,7 +123,7 @@ PUBLISHED = (
 
 
 def libsgm_bytes(pixels: int, levels: int, paths: int) -> int:
-    """Return the bytes that libSGM's path volumes move: each path's is written once and read once, a byte to a cell.
+    """Return the bytes of libSGM's path volumes: each path's is written once and read once, a byte per cell.
 
     Its costs are Hamming distances computed again for every path from the bits, so that there is no volume of costs;
     the bits and images, some bytes to a pixel, are not counted.

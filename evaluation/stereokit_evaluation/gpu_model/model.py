@@ -1,8 +1,8 @@
-"""How long a match would take on a GPU: bytes and instructions of every launch, and a bound on its time. Modelled.
+"""The modelled time of a match on a GPU: bytes and instructions of every launch, and a bound on its time.
 
-The launches are those of the real pipeline (`stereokit.cuda.pipeline`), which runs on a queue that notes them and
-computes nothing. What each kernel reads, writes and loops is told by `work_of` from its arguments; the tests hold that
-to what the interpreter counts (`tests/ptx/test_model.py`). Instructions are those of the assembled code, loop by loop
+The launches are those of the real pipeline (`stereokit.cuda.pipeline`), which runs on a queue that records them and
+computes nothing. `work_of` gives the reads, writes and loops of each kernel from its arguments; the tests compare them
+with the interpreter's counts (`tests/ptx/test_model.py`). Instructions are those of the assembled code, loop by loop
 (`stereokit_evaluation.gpu_model.sass`).
 
 The time of a launch is the longest of
@@ -10,8 +10,8 @@ The time of a launch is the longest of
 - **memory**: bytes moved, by the bandwidth. Of an array that a kernel reads again and again, a sweep counts once:
   caches hold windows and lines, but no volumes;
 - **units**: the instructions of the busiest multiprocessor's warps, by the rate of the busiest execution unit;
-- **waiting**: what one warp takes alone, as often as warps take turns: each instruction waits for the one before it,
-  and each pass of a loop for memory, unless the kernel asks ahead;
+- **waiting**: the time of one warp alone, as often as warps take turns: each instruction waits for the one before it,
+  and each pass of a loop for memory, unless the kernel prefetches;
 
 and a launch's own time is added. Sources and assumptions: `stereokit_evaluation.gpu_model.machines`.
 """
@@ -47,7 +47,7 @@ class Launch:
     kernel : stereokit.cuda.kernel.Kernel
     blocks : int
     work : Work
-        What it does.
+        Its reads, writes and loops.
     read, written : int
         Bytes moved between the memory and the chip.
     """
@@ -76,24 +76,24 @@ def named(kernel: Any, arguments: Iterable[Any]) -> SimpleNamespace:
 
 
 class _Recorder(DryQueue):
-    """A queue that notes launches."""
+    """A queue that records launches."""
 
     def __init__(self) -> None:
         super().__init__()
         self.launches: list[Launch] = []
 
-    def launch(self, what: Any, blocks: int, *arguments: Any) -> None:
-        """Note a launch."""
-        given = named(what, arguments)
-        work = work_of(what, blocks, given)
-        moved = [
+    def launch(self, kernel: Any, blocks: int, *arguments: Any) -> None:
+        """Record a launch."""
+        values = named(kernel, arguments)
+        work = work_of(kernel, blocks, values)
+        nbytes = [
             sum(
-                round(min(count, work.sweeps.get(name, 1) * getattr(given, name).nbytes))
+                round(min(count, work.sweeps.get(name, 1) * getattr(values, name).nbytes))
                 for name, count in side.items()
             )
             for side in (work.reads, work.writes)
         ]
-        self.launches.append(Launch(what, blocks, work, *moved))
+        self.launches.append(Launch(kernel, blocks, work, *nbytes))
 
 
 def record(matcher: Matcher, width: int, height: int) -> list[Launch]:
@@ -123,7 +123,7 @@ def record(matcher: Matcher, width: int, height: int) -> list[Launch]:
 
 @dataclass(frozen=True)
 class Time:
-    """The modelled milliseconds of a launch, and what makes them up.
+    """The modelled milliseconds of a launch, and their parts.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class Time:
 
     @property
     def bound(self) -> str:
-        """Which of the bounds holds."""
+        """The name of the longest bound."""
         return max(("memory", "units", "waiting"), key=lambda name: getattr(self, name))
 
 

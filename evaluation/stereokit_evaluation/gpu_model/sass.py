@@ -1,9 +1,9 @@
 """The assembled code of a CUDA kernel, without a GPU: registers, instructions by execution unit, and loops.
 
-PTX goes through ptxas and nvdisasm, both from PyPI (``stereokit[cuda-test]``). What a warp executes follows from the
-code, from how often it passes the kernel's hot loop, and from how many memory accesses a pass has in the source:
-compilers unroll loops, so that one passage of the assembled loop may be several of the source's, and its accesses tell
-how many. Both sides of a branch inside the loop count, as where lanes of a warp differ.
+PTX goes through ptxas and nvdisasm, both from PyPI (``stereokit[cuda-test]``). The instructions that a warp executes
+follow from the code, from the number of its passes of the kernel's hot loop, and from the memory accesses of a pass in
+the source: compilers unroll loops, so that one pass of the assembled loop may be several of the source's, by the ratio
+of their accesses. Both sides of a branch inside the loop count, as where lanes of a warp differ.
 
 nvdisasm of CUDA 13 does not read code for Volta (sm_72); the code of its sibling sm_75, which has the same instruction
 set, stands in for it. Registers are those of ptxas for sm_72 itself.
@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 ARCHITECTURES = ("sm_72", "sm_75", "sm_87", "sm_90")
-"""What kernels are assembled for: Xavier, Turing, Orin (and its desktop siblings sm_80 and sm_86), Hopper."""
+"""Target architectures: Xavier, Turing, Orin (and its desktop siblings sm_80 and sm_86), Hopper."""
 
 _REGISTERS = 65536  # of a multiprocessor, on all of these
 _WARPS = {"sm_72": 64, "sm_75": 32, "sm_87": 48, "sm_90": 64}
@@ -63,17 +63,17 @@ _UNIT_OF = {opcode: unit for unit, opcodes in UNITS.items() for opcode in opcode
 
 def tool(name: str) -> Path | None:
     """Return the path of a tool of the CUDA toolkit, from its wheels or the search path; None where there is none."""
-    found = importlib.util.find_spec("nvidia")
-    for folder in [] if found is None else found.submodule_search_locations or []:
+    package = importlib.util.find_spec("nvidia")
+    for folder in [] if package is None else package.submodule_search_locations or []:
         # in reverse, cuda_nvcc before cu13, whose ptxas does not know sm_72
         for path in sorted(Path(folder).glob(f"*/bin/{name}"), reverse=True):
             return path
-    beside = shutil.which(name)
-    return None if beside is None else Path(beside)
+    path_on_system = shutil.which(name)
+    return None if path_on_system is None else Path(path_on_system)
 
 
 def require_tools() -> None:
-    """Raise DeviceError, with what to install, unless kernels can be compiled, assembled and disassembled here."""
+    """Raise DeviceError, with the packages to install, unless kernels can be compiled and disassembled here."""
     missing = [name for name in ("ptxas", "nvdisasm") if tool(name) is None]
     if importlib.util.find_spec("numba_cuda") is None:
         missing.insert(0, "numba-cuda")
@@ -83,7 +83,7 @@ def require_tools() -> None:
 
 @dataclass(frozen=True)
 class Resources:
-    """What a kernel takes of a multiprocessor.
+    """The resources of a kernel on a multiprocessor.
 
     Attributes
     ----------
@@ -99,25 +99,25 @@ class Resources:
 
 
 def _run(command: list[Any], text: str | None = None) -> Any:
-    done = subprocess.run([str(word) for word in command], input=text, capture_output=True, text=True, check=False)
-    if done.returncode:
-        said = (done.stderr or done.stdout).strip().splitlines() or ["no message"]
-        raise DeviceError(f"{Path(command[0]).name} must take the kernel, but it says: {said[0]}")
-    return done
+    process = subprocess.run([str(word) for word in command], input=text, capture_output=True, text=True, check=False)
+    if process.returncode:
+        lines = (process.stderr or process.stdout).strip().splitlines() or ["no message"]
+        raise DeviceError(f"{Path(command[0]).name} must take the kernel, but it says: {lines[0]}")
+    return process
 
 
 def resources(ptx: str, architecture: str, cubin: Path | None = None) -> Resources:
-    """Assemble a kernel and return what it takes; `cubin` is where the code goes, if anywhere."""
+    """Assemble a kernel and return its resources; the code goes to `cubin`, if any."""
     command = [tool("ptxas"), f"-arch={architecture}", "-v", "-o", cubin or "/dev/null", "-"]
-    told = _run(command, ptx).stderr
-    registers = int(re.findall(r"Used (\d+) registers", told)[-1])
+    listing = _run(command, ptx).stderr
+    registers = int(re.findall(r"Used (\d+) registers", listing)[-1])
     stack, stores, loads = (int(x) for x in re.findall(
-        r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", told)[-1])  # fmt: skip
+        r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", listing)[-1])  # fmt: skip
     return Resources(registers, stack, stores + loads)
 
 
 def warps_that_fit(registers: int, block: int, architecture: str) -> tuple[int, int]:
-    """Return how many warps of a kernel are resident on a multiprocessor, and how many could be with no registers."""
+    """Return the number of resident warps of a kernel on a multiprocessor, and the bound without registers."""
     in_block = block // 32
     blocks = _REGISTERS // (-(-registers // 8) * 8 * 32 * in_block)
     most = _WARPS[architecture]
@@ -148,19 +148,19 @@ class Code:
         return max(self.loops, key=weight, default=(0, len(self.units)))
 
     def _unrolled(self, loops: Sequence[tuple[int, int]], accesses: float | None) -> float:
-        """Return how many passes of the source are one of these loops."""
-        found = sum(self.units[first:end].count("memory") for first, end in loops)
-        return found / accesses if accesses is not None and found else 1.0
+        """Return the number of the source's passes in one pass of these loops."""
+        count = sum(self.units[first:end].count("memory") for first, end in loops)
+        return count / accesses if accesses is not None and count else 1.0
 
     def executed(self, passes: float, accesses: float | None, every: bool) -> Counter[str]:
-        """Return how many instructions a warp executes, by unit.
+        """Return the number of instructions of a warp, by unit.
 
         Parameters
         ----------
         passes : float
-            How often it passes the hot loop of the source.
+            Passes of the source's hot loop.
         accesses : float or None
-            Memory accesses of one pass, by which the unrolling is found; None takes the code as it is.
+            Memory accesses of one pass, which determine the unrolling; None takes the code as it is.
         every : bool
             Whether all loops together are the hot loop, one after the other, instead of one alone.
         """
@@ -179,17 +179,17 @@ class Code:
 
 def outer_loops(branches: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
     """Return the loops, of (branch, target) places, that lie in no other one; a branch to itself is none."""
-    found: list[tuple[int, int]] = []
-    for first, end in sorted((to, at + 1) for at, to in branches if to < at):
-        if found and first < found[-1][1]:
-            found[-1] = found[-1][0], max(found[-1][1], end)
+    loops: list[tuple[int, int]] = []
+    for first, end in sorted((target, place + 1) for place, target in branches if target < place):
+        if loops and first < loops[-1][1]:
+            loops[-1] = loops[-1][0], max(loops[-1][1], end)
         else:
-            found.append((first, end))
-    return tuple(found)
+            loops.append((first, end))
+    return tuple(loops)
 
 
 def parse_sass(text: str) -> Code:
-    """Return the code that nvdisasm printed."""
+    """Return the code from the output of nvdisasm."""
     labels: dict[str, int] = {}
     lines: list[str] = []
     for line in text.splitlines():
@@ -200,8 +200,8 @@ def parse_sass(text: str) -> Code:
     while lines and lines[-1].startswith("NOP"):
         lines.pop()
     branches = [
-        (at, labels[target[1]])
-        for at, line in enumerate(lines)
+        (place, labels[target[1]])
+        for place, line in enumerate(lines)
         if (target := re.match(r"BRA\b.*?(\.L_\w+)", line)) and target[1] in labels
     ]
     units = (_UNIT_OF.get(re.split(r"[.\s]", line)[0], "other") for line in lines)
@@ -212,6 +212,6 @@ def code_of(ptx: str, architecture: str) -> tuple[Code, Resources]:
     """Assemble and disassemble a kernel; for sm_72 the code is that for sm_75, the registers are its own."""
     with tempfile.TemporaryDirectory() as folder:
         cubin = Path(folder) / "kernel.cubin"
-        taken = resources(ptx, DISASSEMBLED.get(architecture, architecture), cubin)
+        kernel_resources = resources(ptx, DISASSEMBLED.get(architecture, architecture), cubin)
         code = parse_sass(_run([tool("nvdisasm"), "-c", cubin]).stdout)
-    return code, taken if architecture not in DISASSEMBLED else resources(ptx, architecture)
+    return code, kernel_resources if architecture not in DISASSEMBLED else resources(ptx, architecture)

@@ -1,6 +1,6 @@
-"""``stereokit bench --model``: what a GPU is modelled to take for a match, launch by launch, as tables and as JSON.
+"""``stereokit bench --model``: the modelled time of a match on a GPU, launch by launch, as tables and as JSON.
 
-No GPU is asked for and none is used; "modelled" stands in the title and over every time.
+No GPU is needed and none is used; "modelled" stands in the title and over every time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rich.console import Console
 from stereokit.cli.options import write_json
 from stereokit.cli.output import Table
 from stereokit.matching import Matcher
-from stereokit_evaluation.bench.peers import label
+from stereokit_evaluation.bench.baselines import label
 from stereokit_evaluation.bench.table import new_table, versions
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.common.sizes import Size
@@ -27,7 +27,7 @@ from stereokit_evaluation.gpu_model.sass import Code, Resources, code_of, requir
 __all__ = ["Match", "as_json", "assemble", "launches_of", "model", "model_match", "print_models"]
 
 _VOLUMES = ("census_costs", "zncc_costs", "sgm_")
-"""Kernels of which libSGM has the like: costs, paths and selection."""
+"""Kernels with a counterpart in libSGM: costs, paths and selection."""
 _LISTED = MACHINES[1].architecture  # whose instructions stand in the table
 
 
@@ -42,7 +42,7 @@ class Match:
         Of the images, before they are halved.
     scale : float
     levels : int
-        Disparities at the size at which is matched.
+        Disparities at the size of the matching.
     paths : int or None
         Of semi-global matching.
     launches : list of Launch
@@ -68,15 +68,15 @@ class Match:
 
     @property
     def of_libsgm(self) -> float | None:
-        """Bytes of costs, paths and selection, as a multiple of what libSGM's path volumes move; None without SGM."""
+        """Bytes of costs, paths and selection, as a multiple of those of libSGM's path volumes; None without SGM."""
         if self.paths is None:
             return None
-        ours = sum(launch.moved for launch in self.launches if launch.kernel.name.startswith(_VOLUMES))
-        return ours / libsgm_bytes(self.pixels, self.levels, self.paths)
+        nbytes = sum(launch.moved for launch in self.launches if launch.kernel.name.startswith(_VOLUMES))
+        return nbytes / libsgm_bytes(self.pixels, self.levels, self.paths)
 
     @property
     def pixels(self) -> int:
-        """Pixels at the size at which is matched."""
+        """Pixels at the size of the matching."""
         parts = round(1 / self.scale)
         return -(-self.size.width // parts) * -(-self.size.height // parts)
 
@@ -97,7 +97,7 @@ def model(sizes: Sequence[Size], methods: Sequence[str], scale: float, json_file
         If a tool is missing or does not take a kernel.
     """
     require_tools()
-    jobs = [(size, method, *found) for size in sizes for method, found in launches_of(methods, size, scale).items()]
+    jobs = [(size, method, *job) for size in sizes for method, job in launches_of(methods, size, scale).items()]
     code: Assembled = {}
     matches = []
     with progress(sum(len({launch.kernel.name for launch in job[3]}) for job in jobs)) as (_, step):
@@ -110,11 +110,11 @@ def model(sizes: Sequence[Size], methods: Sequence[str], scale: float, json_file
 
 def launches_of(methods: Sequence[str], size: Size, scale: float) -> dict[str, tuple[Matcher, list[Launch]]]:
     """Return the matcher and the launches of each method."""
-    found = {}
+    launches = {}
     for method in methods:
         matcher = Matcher(method, max_disparity=size.levels, scale=scale, device="cpu")
-        found[method] = matcher, record(matcher, size.width, size.height)
-    return found
+        launches[method] = matcher, record(matcher, size.width, size.height)
+    return launches
 
 
 def assemble(launches: Sequence[Launch], code: Assembled, step: Callable[..., None]) -> None:
@@ -145,20 +145,20 @@ def model_match(
 
 
 def _time(launch: Launch, assembled: tuple[Code, Resources], machine: Machine) -> Time:
-    code, taken = assembled
-    return modelled(launch, code, taken.registers, machine)
+    code, resources = assembled
+    return modelled(launch, code, resources.registers, machine)
 
 
 def print_models(matches: Sequence[Match]) -> None:
-    """Print a table for each match, then the machines, and what others published."""
+    """Print a table for each match, then the machines, and the published times."""
     console = Console(width=None if sys.stdout.isatty() else 120)
     for match in matches:
         console.print(_table(match))
         if match.of_libsgm is not None:
-            theirs = libsgm_bytes(match.pixels, match.levels, match.paths or 0)
+            libsgm_nbytes = libsgm_bytes(match.pixels, match.levels, match.paths or 0)
             line = (
                 f"bytes of costs, paths and selection, modelled: {match.of_libsgm:.2f} times those of libSGM's path "
-                f"volumes at this size ({theirs / 1e6:.1f} MB: each path's volume written once and read once)"
+                f"volumes at this size ({libsgm_nbytes / 1e6:.1f} MB: each path's volume written once and read once)"
             )
             console.print(line, markup=False, highlight=False)
     console.print(_machines())
@@ -168,17 +168,17 @@ def print_models(matches: Sequence[Match]) -> None:
 
 
 def _distance() -> str:
-    """Return how far above its memory's bound the published libSGM is, by which these tables may be read."""
+    """Return the ratio of libSGM's published times to their modelled memory bound, as a scale for these tables."""
     width, height, levels, paths = LIBSGM_SIZE
     machines = {machine.name: machine for machine in MACHINES}
-    found = []
-    for one in PUBLISHED:
-        if one.name.startswith("libSGM"):
-            speed = ASSUMED["of_bandwidth"] * machines[one.machine].gb_per_s * 1e6  # bytes a millisecond
+    factors = []
+    for time in PUBLISHED:
+        if time.name.startswith("libSGM"):
+            speed = ASSUMED["of_bandwidth"] * machines[time.machine].gb_per_s * 1e6  # bytes a millisecond
             bound = libsgm_bytes(width * height, levels, paths) / speed
-            found.append(f"{one.ms / bound:.1f} times on {one.machine}")
+            factors.append(f"{time.ms / bound:.1f} times on {time.machine}")
     return (
-        "Bounds are not times: the published libSGM takes " + ", ".join(found) + " what this model's memory bound is "
+        "Bounds are not times: the published libSGM takes " + ", ".join(factors) + " what this model's memory bound is "
         "for its path volumes. Therefore the line with twice the bounds."
     )
 
@@ -202,8 +202,8 @@ def _table(match: Match) -> Table:
         table.add_column(head, justify="right")
     names = list(dict.fromkeys(launch.kernel.name for launch in match.launches))
     for name in names:
-        chosen = [at for at, launch in enumerate(match.launches) if launch.kernel.name == name]
-        table.add_row(name, *_figures(match, chosen), *(_cell(match, machine, chosen) for machine in MACHINES))
+        indices = [k for k, launch in enumerate(match.launches) if launch.kernel.name == name]
+        table.add_row(name, *_figures(match, indices), *(_cell(match, machine, indices) for machine in MACHINES))
     table.add_section()
     everything = range(len(match.launches))
     totals = (f"{match.ms(machine.name):.2f}  " for machine in MACHINES)
@@ -215,19 +215,19 @@ def _table(match: Match) -> Table:
     return table
 
 
-def _figures(match: Match, chosen: Sequence[int]) -> tuple[str, ...]:
-    launches = [match.launches[at] for at in chosen]
+def _figures(match: Match, indices: Sequence[int]) -> tuple[str, ...]:
+    launches = [match.launches[k] for k in indices]
     read, written = (sum(getattr(one, side) for one in launches) / 1e6 for side in ("read", "written"))
     return (
         str(len(launches)),
         f"{read:.2f}",
         f"{written:.2f}",
-        f"{sum(match.instructions[at] for at in chosen) / 1e6:.2f}",
+        f"{sum(match.instructions[k] for k in indices) / 1e6:.2f}",
     )
 
 
-def _cell(match: Match, machine: Machine, chosen: Sequence[int]) -> str:
-    times = [match.times[machine.name][at] for at in chosen]
+def _cell(match: Match, machine: Machine, indices: Sequence[int]) -> str:
+    times = [match.times[machine.name][k] for k in indices]
     longest = max(times, key=lambda time: time.ms)
     return f"{sum(time.ms for time in times):.3f} {longest.bound[0]}"
 
@@ -244,7 +244,7 @@ def _machines() -> Table:
 
 
 def _published() -> Table:
-    table = new_table("published by others, measured; beside it nothing here is but modelled", "")
+    table = new_table("published by others, measured; all other tables are modelled", "")
     for head in ("GPU", "size", "ms", "source"):
         table.add_column(head, justify="right" if head == "ms" else "left")
     for one in PUBLISHED:
@@ -253,7 +253,7 @@ def _published() -> Table:
 
 
 def as_json(matches: Sequence[Match]) -> dict[str, Any]:
-    """Return the matches, the machines and what others published."""
+    """Return the matches, the machines and the published times."""
     return {
         "modelled": [
             {
@@ -270,16 +270,16 @@ def as_json(matches: Sequence[Match]) -> dict[str, Any]:
                         "blocks": launch.blocks,
                         "read": launch.read,
                         "written": launch.written,
-                        f"instructions_{_LISTED}": match.instructions[at],
+                        f"instructions_{_LISTED}": match.instructions[k],
                         "modelled_ms": {
                             name: {
-                                "memory": times[at].memory, "units": times[at].units, "waiting": times[at].waiting,
-                                "launch": times[at].launch, "all": times[at].ms,
+                                "memory": times[k].memory, "units": times[k].units, "waiting": times[k].waiting,
+                                "launch": times[k].launch, "all": times[k].ms,
                             }
                             for name, times in match.times.items()
                         },
                     }
-                    for at, launch in enumerate(match.launches)
+                    for k, launch in enumerate(match.launches)
                 ],
             }
             for match in matches

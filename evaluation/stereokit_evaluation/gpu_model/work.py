@@ -1,6 +1,6 @@
-"""What each CUDA kernel of a match reads, writes and loops, from the arguments of its launch.
+"""The work of each CUDA kernel of a match: its reads, writes and loops, from the arguments of its launch.
 
-Bytes are those that threads ask for, array by array. A pass is one of the hot loop in the kernel's source; `accesses`
+Bytes are those that threads request, array by array. A pass is one of the hot loop in the kernel's source; `accesses`
 are the loads and stores of one pass. Loops whose length depends on the images (of speckles, of gaps) count one pass.
 """
 
@@ -21,22 +21,22 @@ Sizes = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Work:
-    """What a launch does.
+    """The work of a launch.
 
     Attributes
     ----------
     reads, writes : mapping of str to float
-        Bytes that all threads ask for, by the name of the array.
+        Bytes that all threads request, by the name of the array.
     passes : float
         Passes of the hot loop, of a mean warp; without effect where there is no loop.
     accesses : float or None
-        Loads and stores of a pass; None where nothing is known of it.
+        Loads and stores of a pass; None where they are unknown.
     every : bool
         All loops of the code together are one pass.
     ahead : bool
-        A pass asks for the data of the next one.
+        A pass requests the data of the next one.
     sweeps : mapping of str to int
-        How often the kernel goes through all of an array that is larger than any cache, once if it is not here.
+        Number of passes of the kernel over an array that is larger than any cache; 1 for arrays that are not here.
     """
 
     reads: Sizes
@@ -136,8 +136,8 @@ def _sgm_paths(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Wor
     rows = 2 * in_block * -(-a.height // in_block)  # lines, and those past the last that only keep warps whole
     columns = in_block * blocks - rows
     steps = rows * a.width + columns * a.height
-    asked = steps + rows + columns  # one pixel more than a line has
-    reads = {"costs": padded * asked, "guide": lanes * asked, "table": 4 * 128 * blocks * (3 + a.count)}
+    requested = steps + rows + columns  # one pixel more than a line has
+    reads = {"costs": padded * requested, "guide": lanes * requested, "table": 4 * 128 * blocks * (3 + a.count)}
     writes = {"out": padded * a.count * a.height * a.width}
     passes = steps / (rows + columns)
     sweeps = {"costs": a.count, "guide": a.count}
@@ -147,8 +147,8 @@ def _sgm_paths(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Wor
 def _sgm_final(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Work:
     padded, others = numbers[0], numbers[1] - 1
     lanes, loads = _loads(padded)
-    asked = blocks * (128 // lanes) * (a.height + 1)
-    reads = {"costs": padded * asked, "guide": lanes * asked, "stored": others * padded * asked}
+    requested = blocks * (128 // lanes) * (a.height + 1)
+    reads = {"costs": padded * requested, "guide": lanes * requested, "stored": others * padded * requested}
     writes = {"disparity": 4 * a.height * a.width, "cost": 2 * a.height * a.width}
     return Work(reads, writes, a.height, loads * (1 + others) + 4, ahead=True)
 
@@ -161,9 +161,9 @@ def _dt_edges(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Work
 def _dt_walk(volume: Any, threads: int, count: int, writes: Sizes, stores: int) -> Work:
     """Return the work of threads that walk `count` pixels there, in segments of 8, and back."""
     segments = -(-count // 8)
-    twice = 2 * segments - 1  # segments walked there: all but the last for its mark, and all again
+    visits = 2 * segments - 1  # segments walked there: all but the last for its mark, and all again
     marks = 8 * threads * (segments - 1)
-    reads = {"volume": 4 * threads * 8 * twice, "weights": 2 * threads * (8 * twice + count), "marks": marks}
+    reads = {"volume": 4 * threads * 8 * visits, "weights": 2 * threads * (8 * visits + count), "marks": marks}
     accesses = (8 + 8 + 1) + (8 + 8 + 2 + 8) + 8 * stores
     return Work(reads, {"marks": marks, **writes}, segments, accesses, every=True, sweeps={"volume": 2})
 
@@ -244,7 +244,7 @@ def work_of(kernel: Any, blocks: int, arguments: SimpleNamespace) -> Work:
     Raises
     ------
     DeviceError
-        If nothing is known of this kernel: options that are not the defaults may need others.
+        If this kernel is unknown: options other than the defaults may need others.
     """
     stem = re.sub(r"(_u?int\d+|_\d+x\d+|_\d+)*$", "", kernel.name)
     if stem not in _RULES:

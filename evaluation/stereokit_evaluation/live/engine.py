@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,6 +19,7 @@ from stereokit.images.check import check_number
 from stereokit.images.intensity import display_8bit
 from stereokit.notices import collecting
 from stereokit.result import color_range
+from stereokit.rig import Rectification
 from stereokit_evaluation.live.source import Frame, Source
 
 __all__ = ["CHANGEABLE", "Engine", "View"]
@@ -67,6 +68,8 @@ class Engine:
         Called, from the engine's thread, after each frame and at the end.
     threads, device
         As for `stereokit.Matcher`.
+    rectify : callable or None
+        For raw cameras: returns the rectification of images of a size (width, height), which gives the calibration too.
     **settings
         Of `CHANGEABLE`, and options of the stages, which stay.
 
@@ -78,7 +81,8 @@ class Engine:
 
     def __init__(
         self, source: Source, calibration: Calibration | None = None, listener: Callable[[], None] | None = None,
-        threads: int | None = None, device: str = "auto", **settings: Any,
+        threads: int | None = None, device: str = "auto",
+        rectify: Callable[[tuple[int, int]], Rectification] | None = None, **settings: Any,
     ) -> None:  # fmt: skip
         defaults = {
             "method": "census+sgm", "max_disparity": 128, "min_disparity": 0, "scale": 1.0, "refiner": None,
@@ -86,10 +90,12 @@ class Engine:
         }  # fmt: skip
         self.source = source
         self.calibration = calibration
+        self._rectify = rectify
+        self._rectification: Rectification | None = None
         self.listener = listener or (lambda: None)
         self.settings = {name: settings.pop(name, value) for name, value in defaults.items()}
         self._fixed = {"threads": threads, "device": device, **settings}
-        self._matcher = self._made(self.settings)
+        self._matcher = self._new_matcher(self.settings)
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._done: deque[float] = deque()
@@ -97,9 +103,9 @@ class Engine:
         self.matched = 0
         self.message = ""
         self.ended = False
-        self._thread = threading.Thread(target=self._run, name="stereokit live", daemon=True)
+        self.thread = threading.Thread(target=self._run, name="stereokit live", daemon=True)
 
-    def _made(self, settings: dict[str, Any]) -> Matcher:
+    def _new_matcher(self, settings: dict[str, Any]) -> Matcher:
         check_number("confidence", settings["confidence"], 0, 1)
         options = {name: value for name, value in settings.items() if name != "confidence"}
         if options["scale"] == 1 and options["refiner"] == "linear":
@@ -108,14 +114,14 @@ class Engine:
 
     def start(self) -> None:
         """Begin."""
-        self._thread.start()
+        self.thread.start()
 
     def close(self) -> None:
         """End, after the frame that is being matched."""
         self._stop.set()
         self.source.close()
-        if self._thread.is_alive():
-            self._thread.join()
+        if self.thread.is_alive():
+            self.thread.join()
 
     def change(self, **changes: Any) -> dict[str, Any]:
         """Change settings from the next frame on; return all of them.
@@ -129,7 +135,7 @@ class Engine:
             if name not in CHANGEABLE:
                 raise OptionError(f"settings that can change are {', '.join(CHANGEABLE)}, got {shown(name)}")
         settings = {**self.settings, **changes}
-        matcher = self._made(settings)
+        matcher = self._new_matcher(settings)
         with self._lock:
             self.settings, self._matcher = settings, matcher
         return settings
@@ -170,7 +176,8 @@ class Engine:
         disparity = float(result.disparity[y, x])
         depth = None
         if self.calibration is not None:
-            depth = float(self.calibration.disparity_to_depth(result.disparity[y : y + 1, x : x + 1])[0, 0])
+            camera = replace(self.calibration, width=None, height=None)  # for a part of a map
+            depth = float(camera.disparity_to_depth(result.disparity[y : y + 1, x : x + 1])[0, 0])
         assert result.confidence is not None
         numbers = {"disparity": disparity, "confidence": float(result.confidence[y, x]), "depth": depth}
         finite = {name: value if value is not None and np.isfinite(value) else None for name, value in numbers.items()}
@@ -221,7 +228,8 @@ class Engine:
         begin = time.perf_counter()
         try:
             with collecting(lines.append):
-                result = matcher(frame.left, frame.right)
+                left, right, masks = self._rectified(frame)
+                result = matcher(left, right, **masks)
         except StereokitError as error:  # such as a refiner that cannot be loaded: say so, and go on
             self.message = str(error)
             return
@@ -229,13 +237,23 @@ class Engine:
         self.message = lines[0] if lines else ""
         span = color_range(result.disparity)
         self.view = View(
-            frame, result, _jpeg(frame.left), _jpeg(_picture(result, settings["confidence"], span)), span, milliseconds
+            frame, result, _jpeg(left), _jpeg(_picture(result, settings["confidence"], span)), span, milliseconds
         )
         self.matched += 1
         now = time.monotonic()
         self._done.append(now)
         while self._done and now - self._done[0] > _RECENT:
             self._done.popleft()
+
+    def _rectified(self, frame: Frame) -> tuple[Any, Any, dict[str, NDArray[np.bool_]]]:
+        """Return the images of a frame as they are matched, and their masks."""
+        if self._rectify is None:
+            return frame.left, frame.right, {}
+        size = frame.left.shape[1], frame.left.shape[0]
+        if self._rectification is None or self._rectification.raw_size != size:
+            self._rectification = self._rectify(size)
+            self.calibration = self._rectification.calibration
+        return (*self._rectification(frame.left, frame.right), self._rectification.masks)
 
 
 def _picture(result: Disparity, least: float, span: tuple[float, float]) -> NDArray[np.uint8]:

@@ -1,1 +1,1 @@
-"""The pages that a browser shows."""
+"""Reports as web pages."""

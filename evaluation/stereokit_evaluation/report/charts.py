@@ -1,7 +1,7 @@
 """The charts of the report as Plotly figures (plain dictionaries): the paper's bar charts and its accuracy-time plot.
 
 Published figures are hatched bars and hollow markers, ours solid ones, so that they differ by more than colour.
-Colours are those of Okabe and Ito (2008), which the colour-blind tell apart.
+Colours are those of Okabe and Ito (2008), which the colour-blind can distinguish.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stereokit_evaluation.data import published
-from stereokit_evaluation.study.configurations import PAPER_SETTINGS, title
+from stereokit_evaluation.study.configurations import PAPER_VARIANTS, title
 
 __all__ = ["REGIONS", "accuracy_time", "bars", "colour"]
 
@@ -22,24 +22,24 @@ REGIONS = {
     "occ bg": "with occluded, background",
     "occ fg": "with occluded, foreground",
 }
-"""The regions that the charts can show, by the keys of the JSON joined with a blank."""
+"""The regions of the charts, by the keys of the JSON joined with a blank."""
 
 _COLOURS = {"linear": "#56b4e9", "original": "#e69f00", "cnn": "#009e73", "stereovae": "#d55e00"}
 _OTHERS = ("#cc79a7", "#0072b2", "#f0e442")
 _TICKS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000]
-_PEER_COLOUR = "#8a8a8a"
+_BASELINE_COLOUR = "#8a8a8a"
 
-Row = Mapping[str, Any]
-
-
-def colour(setting: str, settings: Sequence[str]) -> str:
-    """Return the colour of a setting; those that the paper does not have share three."""
-    others = [name for name in settings if name not in _COLOURS]
-    return _COLOURS.get(setting) or _OTHERS[others.index(setting) % len(_OTHERS)]
+JsonRow = Mapping[str, Any]
 
 
-def bars(rows: Sequence[Row], figure: str, name: str) -> dict[str, Any]:
-    """Return one of the paper's bar charts, with ours beside the published bars.
+def colour(variant: str, variants: Sequence[str]) -> str:
+    """Return the colour of a variant; variants beyond the paper's share three."""
+    others = [name for name in variants if name not in _COLOURS]
+    return _COLOURS.get(variant) or _OTHERS[others.index(variant) % len(_OTHERS)]
+
+
+def bars(rows: Sequence[JsonRow], figure: str, name: str) -> dict[str, Any]:
+    """Return one of the paper's bar charts, with our bars and the published ones.
 
     Parameters
     ----------
@@ -50,29 +50,31 @@ def bars(rows: Sequence[Row], figure: str, name: str) -> dict[str, Any]:
     name : str
         The data set, for the legend.
     """
-    theirs = {"e4": published.VALIDATION, "e5": published.TEST}[figure]
+    paper = {"e4": published.VALIDATION, "e5": published.TEST}[figure]
     ours = [row for row in rows if row["setting"] != "peer"]
     matchers = list(dict.fromkeys(row["matcher"] for row in ours))
-    settings = [s for s in dict.fromkeys(_setting(row) for row in ours)]
-    shown = [s for s in (*PAPER_SETTINGS, *settings) if s in settings or any(s in part for part in theirs.values())]
+    ours_by_name = list(dict.fromkeys(_variant(row) for row in ours))
+    published_names = {name for part in paper.values() for name in part}
+    chart_variants = [s for s in (*PAPER_VARIANTS, *ours_by_name) if s in ours_by_name or s in published_names]
     traces: list[dict[str, Any]] = []
-    variants: dict[str, list[Any]] = {region: [] for region in REGIONS}
-    for setting in dict.fromkeys(shown):
-        tint = colour(setting, shown)
-        printed = [theirs.get(matcher, {}).get(setting) for matcher in matchers]
-        if any(value is not None for value in printed):
-            hatched = {"color": tint, "pattern": {"shape": "/", "fgcolor": tint, "bgcolor": "rgba(0,0,0,0)", "size": 6}}
-            line = {"color": tint, "width": 1.5}
-            traces.append(_bar(f"{title(setting)}, published", matchers, printed, {**hatched, "line": line}))
-            for values in variants.values():
-                values.append(printed)
-        cells = {row["matcher"]: row for row in ours if _setting(row) == setting and row["missing"] is None}
+    heights_by_region: dict[str, list[Any]] = {region: [] for region in REGIONS}
+    for variant in dict.fromkeys(chart_variants):
+        color = colour(variant, chart_variants)
+        paper_values = [paper.get(matcher, {}).get(variant) for matcher in matchers]
+        if any(value is not None for value in paper_values):
+            pattern = {"shape": "/", "fgcolor": color, "bgcolor": "rgba(0,0,0,0)", "size": 6}
+            hatched = {"color": color, "pattern": pattern}
+            line = {"color": color, "width": 1.5}
+            traces.append(_bar(f"{title(variant)}, published", matchers, paper_values, {**hatched, "line": line}))
+            for values in heights_by_region.values():
+                values.append(paper_values)
+        cells = {row["matcher"]: row for row in ours if _variant(row) == variant and row["missing"] is None}
         measured = {region: [_d1(cells[m], region) if m in cells else None for m in matchers] for region in REGIONS}
         if cells:
-            traces.append(_bar(f"{title(setting)}, {name}", matchers, measured["noc all"], {"color": tint}))
-            for region, values in variants.items():
+            traces.append(_bar(f"{title(variant)}, {name}", matchers, measured["noc all"], {"color": color}))
+            for region, values in heights_by_region.items():
                 values.append(measured[region])
-    heights = [y for values in variants.values() for bars in values for y in bars if y is not None]
+    heights = [y for values in heights_by_region.values() for bars in values for y in bars if y is not None]
     room = 1.18 * max(heights, default=1.0)  # for the figures above the bars
     layout = {
         "barmode": "group",
@@ -80,39 +82,39 @@ def bars(rows: Sequence[Row], figure: str, name: str) -> dict[str, Any]:
         "yaxis": {"title": {"text": "D1 error, %"}, "range": [0, room]},
         "legend": {"orientation": "h", "y": -0.16},
     }
-    return {"data": traces, "layout": layout, "variants": {"y": variants}}
+    return {"data": traces, "layout": layout, "variants": {"y": heights_by_region}}
 
 
-def accuracy_time(rows: Sequence[Row]) -> dict[str, Any]:
+def accuracy_time(rows: Sequence[JsonRow]) -> dict[str, Any]:
     """Return the paper's figure 1: error against time, with ours and OpenCV's on this machine."""
     traces: list[dict[str, Any]] = []
-    variants: dict[str, list[Any]] = {region: [] for region in REGIONS}
-    settings = list(dict.fromkeys(_setting(row) for row in rows if row["setting"] != "peer"))
-    groups = [(title(s), [r for r in rows if _setting(r) == s], colour(s, settings), "circle") for s in settings]
-    groups.append(("OpenCV", [row for row in rows if row["setting"] == "peer"], _PEER_COLOUR, "square"))
-    for name, members, tint, symbol in groups:
+    errors_by_region: dict[str, list[Any]] = {region: [] for region in REGIONS}
+    variants = list(dict.fromkeys(_variant(row) for row in rows if row["setting"] != "peer"))
+    groups = [(title(s), [r for r in rows if _variant(r) == s], colour(s, variants), "circle") for s in variants]
+    groups.append(("OpenCV", [row for row in rows if row["setting"] == "peer"], _BASELINE_COLOUR, "square"))
+    for name, members, color, symbol in groups:
         scored = [row for row in members if row["missing"] is None and row["ms"]]
         if not scored:
             continue
-        marker = {"color": tint, "size": 12, "symbol": symbol}
+        marker = {"color": color, "size": 12, "symbol": symbol}
         labels = [row["matcher"].removeprefix("OpenCV ") for row in scored]
         x = [_d1(row, "noc all") for row in scored]
         traces.append(_points(f"{name}, this machine", x, [row["ms"]["total"] for row in scored], labels, marker))
-        for region, values in variants.items():
+        for region, values in errors_by_region.items():
             values.append([_d1(row, region) for row in scored])
     points = published.FIGURE_1
     marker = {"color": "#d55e00", "size": 12, "symbol": "diamond-open", "line": {"width": 2}}
     sources = [f"{p.source}{', pixels: ' + p.pixels if p.pixels else ''}" for p in points]
     x, y = [p.d1 for p in points], [p.ms for p in points]
     traces.append(_points("published, Jetson AGX Xavier", x, y, [p.name for p in points], marker, sources))
-    for values in variants.values():
+    for values in errors_by_region.values():
         values.append(x)
     layout = {
         "xaxis": {"title": {"text": "D1 error, %"}, "rangemode": "tozero"},
         "yaxis": {"title": {"text": "time, ms"}, "type": "log", "tickvals": _TICKS, "ticktext": _TICKS},
         "legend": {"orientation": "h", "y": -0.2},
     }
-    return {"data": traces, "layout": layout, "variants": {"x": variants}}
+    return {"data": traces, "layout": layout, "variants": {"x": errors_by_region}}
 
 
 def _bar(name: str, x: Sequence[str], y: Sequence[float | None], marker: dict[str, Any]) -> dict[str, Any]:
@@ -145,11 +147,11 @@ def _points(
     }
 
 
-def _setting(row: Row) -> str:
+def _variant(row: JsonRow) -> str:
     return "original" if row["refiner"] is None else str(row["refiner"])
 
 
-def _d1(row: Row, region: str) -> float | None:
+def _d1(row: JsonRow, region: str) -> float | None:
     pixels, part = region.split()
     value: float | None = row["d1"][pixels][part]
     return value

@@ -1,4 +1,4 @@
-"""Disparity maps in a web page: exact to 1/32 pixel, as small as an image, and read without one.
+"""Disparity maps in a web page: exact to 1/32 pixel, as small as an image, and read without a canvas.
 
 A canvas gives back 8 bits a channel, and some browsers change them against tracking; so maps are not hidden in
 pictures. A map becomes whole numbers of 1/16 pixel, each predicted from its left, upper and upper left neighbour (the
@@ -25,7 +25,7 @@ STEPS = 16
 
 
 def pack_map(disparity: ArrayLike) -> dict[str, Any]:
-    """Return a disparity map as something that JSON can say.
+    """Return a disparity map as JSON values.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def pack_map(disparity: ArrayLike) -> dict[str, Any]:
     if stored.max(initial=0) > 65535:
         raise InputError(f"disparity must span less than 4095 pixels, got {stored.max() / STEPS:.0f}")
     stored = stored.astype(np.int32)
-    # A difference of 16-bit numbers has 17 bits, but modulo 2**16 it says as much.
+    # A difference of 16-bit numbers has 17 bits, but modulo 2**16 it carries the same information.
     change = (stored - _predicted(stored)).astype(np.int16).astype(np.int32)
     folded = ((change << 1) ^ (change >> 31)).astype(np.uint16)
     planes = np.stack([folded & 255, folded >> 8]).astype(np.uint8)

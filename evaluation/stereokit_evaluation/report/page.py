@@ -26,7 +26,7 @@ from stereokit_evaluation.data import published
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.report import charts, viewer
 from stereokit_evaluation.scoring.runner import Scored
-from stereokit_evaluation.study.run import Row, Study
+from stereokit_evaluation.study.run import Study, StudyRow
 from stereokit_evaluation.study.table import missing_lines
 
 __all__ = ["chosen_frames", "render", "require", "write_report"]
@@ -44,11 +44,11 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
     document : dict
         The study's JSON.
     study : Study
-        Its rows; their matchers make the maps to look at.
+        Its rows; their matchers compute the maps of the viewer.
     frames : sequence of Frame
         Those that were scored.
     show : int
-        How many of them to show in the viewer, spread from the easiest to the hardest.
+        Number of frames in the viewer, spread from the easiest to the hardest.
 
     Raises
     ------
@@ -59,15 +59,15 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
     """
     rows = document["results"]
     title = f"{document['dataset']}{', ' + document['split'] if document['split'] else ''}"
-    drawn = {
+    figures = {
         "chart-e4": charts.bars(rows, "e4", document["dataset"]),
         "chart-e5": charts.bars(rows, "e5", document["dataset"]),
         "chart-time": charts.accuracy_time(rows),
     }
     page = render(
         "study.html.j2",
-        [_look(frame, study.rows) for frame in chosen_frames(frames, study.rows, show)],
-        charts=drawn,
+        [_viewer_pair(frame, study.rows) for frame in chosen_frames(frames, study.rows, show)],
+        charts=figures,
         title=f"Robustness study: {title}",
         document=document,
         rows=rows,
@@ -91,11 +91,11 @@ def render(
     template : str
         A file of ``assets``.
     pairs : sequence of dict
-        What `stereokit_evaluation.report.viewer.pair` returns, for the viewer.
+        Results of `stereokit_evaluation.report.viewer.pair`, for the viewer.
     charts : dict, optional
         Plotly figures by the id of the element that they go to; without them the page has no Plotly.
     **content
-        What the template asks for.
+        The variables of the template.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def render(
     return text.encode()
 
 
-def chosen_frames(frames: Sequence[Frame], rows: Sequence[Row], show: int) -> list[Frame]:
+def chosen_frames(frames: Sequence[Frame], rows: Sequence[StudyRow], show: int) -> list[Frame]:
     """Return `show` of the frames, evenly spaced in difficulty from the easiest to the hardest.
 
     Difficulty is the D1 error pooled over all our rows.
@@ -144,15 +144,15 @@ def chosen_frames(frames: Sequence[Frame], rows: Sequence[Row], show: int) -> li
     return [ranked[round(float(place))] for place in places]
 
 
-def _first_methods(rows: Sequence[Row]) -> list[str]:
-    """Return the two methods that the viewer starts with: the best by D1, against one of the same matcher."""
+def _first_methods(rows: Sequence[StudyRow]) -> list[str]:
+    """Return the first two methods of the viewer: the best by D1, against one of the same matcher."""
     scored = [row for row in rows if row.missing is None and row.result.frames]
     best = min(scored, key=lambda row: row.result.score.main.filled.d1() or 0.0)
     others = sorted((row for row in scored if row is not best), key=lambda row: _label(row) != _label(best))
     return [row.configuration.name for row in (best, *others, best)[:2]]
 
 
-def _label(row: Row) -> str:
+def _label(row: StudyRow) -> str:
     return row.configuration.label
 
 
@@ -160,17 +160,17 @@ def _share(counts: Sequence[int]) -> float:
     return counts[0] / counts[1] if counts[1] else 0.0
 
 
-def _look(frame: Frame, rows: Sequence[Row]) -> dict[str, Any]:
+def _viewer_pair(frame: Frame, rows: Sequence[StudyRow]) -> dict[str, Any]:
     """Match a frame once more with every configuration, for the viewer."""
     left, right = frame.load_left(gray=True), frame.load_right(gray=True)
     maps = []
     for row in rows:
-        scored = next((one for one in row.result.frames if one.name == frame.name), None)
+        scored = next((candidate for candidate in row.result.frames if candidate.name == frame.name), None)
         if row.configuration.matcher is not None and scored is not None:
-            with collecting():  # told when it was scored
-                found = row.configuration.matcher(left, right)
-            disparity, valid = np.asarray(found.disparity), np.asarray(found.valid)
-            maps.append(viewer.Shown(row.configuration.name, disparity, valid, _note(scored)))
+            with collecting():  # reported when it was scored
+                result = row.configuration.matcher(left, right)
+            disparity, valid = np.asarray(result.disparity), np.asarray(result.valid)
+            maps.append(viewer.MethodMap(row.configuration.name, disparity, valid, _note(scored)))
     return viewer.pair(
         frame.name,
         frame.load_left(),

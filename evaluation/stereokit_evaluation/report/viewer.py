@@ -1,7 +1,7 @@
-"""What the viewer of the reports shows of one stereo pair: the left image, maps, truth, geometry.
+"""The data of the reports' viewer for one stereo pair: the left image, maps, truth, geometry.
 
 The page draws pictures, errors and points itself from the maps (`stereokit_evaluation.report.packing`), so that
-hovering reads numbers and a method more costs one map.
+hovering reads numbers and each further method costs one map.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from stereokit_evaluation.report.packing import pack_map, pack_mask
 from stereokit_evaluation.scoring.error_map import COLOURS, EDGES
 from stereokit_evaluation.scoring.kitti import D1_PIXELS, D1_SHARE, fill_background
 
-__all__ = ["Shown", "constants", "pair"]
+__all__ = ["MethodMap", "constants", "pair"]
 
 _JPEG_QUALITY = 85
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """One map to look at.
+class MethodMap:
+    """The map of one method.
 
     Attributes
     ----------
     name : str
-        What the viewer calls it.
+        The name in the viewer.
     disparity : (H, W) float32
         Pixels, NaN where unknown.
     valid : (H, W) bool
         Where it was measured.
     note : str
-        A few words beside the name, such as its error on this pair.
+        A short text next to the name, such as its error on this pair.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Shown:
 
 
 def constants() -> dict[str, Any]:
-    """Return what the page needs to draw any pair: Turbo's colours, and the colours and the rule of errors."""
+    """Return the constants for drawing any pair: Turbo's colours, and the colours and the rule of errors."""
     ramp = np.linspace(0.0, 1.0, 256, dtype=np.float32)[None]
     return {
         "turbo": colorize(ramp, 0.0, 1.0)[0].tolist(),
@@ -62,7 +62,7 @@ def constants() -> dict[str, Any]:
 def pair(
     name: str,
     left: NDArray[Any],
-    maps: Sequence[Shown],
+    maps: Sequence[MethodMap],
     *,
     noc: NDArray[np.float32] | None = None,
     occ: NDArray[np.float32] | None = None,
@@ -91,7 +91,7 @@ def pair(
     if not maps:
         raise InputError("maps must hold at least one map, got none")
     height, width = left.shape[:2]
-    for label, array in (("noc", noc), ("occ", occ), *((shown.name, shown.disparity) for shown in maps)):
+    for label, array in (("noc", noc), ("occ", occ), *((method_map.name, method_map.disparity) for method_map in maps)):
         if array is not None and array.shape != (height, width):
             raise InputError(f"{label} must have the size of the left image, {(height, width)}, got {array.shape}")
     truth = noc if occ is None else occ
@@ -107,16 +107,16 @@ def pair(
         "truth": None if truth is None else pack_map(truth),
         "seen": None if noc is None or occ is None else pack_mask(np.isfinite(noc)),
         "calibration": None if calibration is None else _geometry(calibration, width, height),
-        "maps": [_packed(shown) for shown in maps],
+        "maps": [_packed(method_map) for method_map in maps],
     }
 
 
-def _packed(shown: Shown) -> dict[str, Any]:
-    known = np.isfinite(shown.disparity)
+def _packed(method_map: MethodMap) -> dict[str, Any]:
+    known = np.isfinite(method_map.disparity)
     # Filling for scoring takes negative values for unknown, so only maps with gaps go through it.
-    filled = shown.disparity if known.all() else fill_background(shown.disparity)
-    measured = pack_mask(known & shown.valid)
-    return {"name": shown.name, "note": shown.note, "measured": measured, "map": pack_map(filled)}
+    filled = method_map.disparity if known.all() else fill_background(method_map.disparity)
+    measured = pack_mask(known & method_map.valid)
+    return {"name": method_map.name, "note": method_map.note, "measured": measured, "map": pack_map(filled)}
 
 
 def _geometry(calibration: Calibration, width: int, height: int) -> dict[str, float]:
@@ -128,8 +128,8 @@ def _geometry(calibration: Calibration, width: int, height: int) -> dict[str, fl
 def _jpeg(image: NDArray[Any]) -> str:
     """Return an image as a data URI."""
     image = display_8bit(image)
-    stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
-    done, data = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    if not done:
+    bgr = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
+    ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if not ok:
         raise InputError(f"left cannot be written as JPEG, got shape {image.shape}")
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

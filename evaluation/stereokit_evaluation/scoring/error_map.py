@@ -1,4 +1,4 @@
-"""The error maps of the KITTI benchmark: where a disparity map is wrong, and by how much, in ten colours.
+"""The error maps of the KITTI benchmark: the error of each pixel of a disparity map in ten colours.
 
 Source: ``io_disp.h`` (`errorImage` with logarithmic colours) and ``log_colormap.h`` of the KITTI 2015
 development kit. The error is ``n = min(|e| / 3, 20 * |e| / gt)``, so that ``n > 1`` is a D1 error: blues are
@@ -67,20 +67,20 @@ def error_map(
     """
     filled = fill_background(estimate)
     truth = np.asarray(occ, np.float32)
-    seen = truth if noc is None else np.asarray(noc, np.float32)
-    for name, array in (("occ", truth), ("noc", seen)):
+    visible = truth if noc is None else np.asarray(noc, np.float32)
+    for name, array in (("occ", truth), ("noc", visible)):
         if array.shape != filled.shape:
             raise InputError(f"{name} must have the size of the estimate, {filled.shape}, got {array.shape}")
     valid = np.isfinite(truth) & (truth >= 0)
-    true = truth[valid]
-    found = filled[valid]
-    error = np.abs(np.where(np.isnan(found), np.float32(-1.0), found) - true).astype(np.float64)
+    true_values = truth[valid]
+    values = filled[valid]
+    error = np.abs(np.where(np.isnan(values), np.float32(-1.0), values) - true_values).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         # 0 / 0 is no error: fmin takes the other, |e| / 3.
-        normalised = np.fmin(error / 3.0, 20.0 * error / true).astype(np.float32)
+        normalised = np.fmin(error / 3.0, 20.0 * error / true_values).astype(np.float32)
     step = np.searchsorted(np.array(EDGES, np.float32), normalised, side="right")
     colour = np.array(COLOURS, np.uint8)[step]
-    hidden = ~(np.isfinite(seen) & (seen >= 0))[valid]
+    hidden = ~(np.isfinite(visible) & (visible >= 0))[valid]
     colour[hidden] //= 2
     picture = np.zeros((*filled.shape, 3), np.uint8)
     picture[valid] = colour

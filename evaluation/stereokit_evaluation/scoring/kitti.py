@@ -1,8 +1,8 @@
-"""The KITTI 2015 stereo evaluation, pixel for pixel, and the bad-x and end-point errors beside it.
+"""The KITTI 2015 stereo evaluation, pixel for pixel, and the bad-x and end-point errors.
 
 Source: the official development kit, ``evaluate_scene_flow.cpp`` (`disparityErrorsOutlier`) and ``io_disp.h``
 (`interpolateBackground`, `readDisparityMap`, `writeDisparityMap`); Menze and Geiger, "Object scene flow for
-autonomous vehicles", CVPR 2015. Four of its details are easy to miss and are kept:
+autonomous vehicles", CVPR 2015. Four of its details are easy to miss and are reproduced:
 
 * Errors are **pooled**: pixel counts are added over all images and divided once. So a score is a record of
   counts that can be added, and percentages appear only at the end.
@@ -99,7 +99,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Counts:
-    """Two tallies of the same pixels: of the filled map, and of what was measured before the fill.
+    """Two tallies of the same pixels: of the filled map, and of the measured pixels before the fill.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class Regions:
 
 @dataclass(frozen=True)
 class Score:
-    """What one or many images scored against both ground truths; ``sum(scores, Score())`` pools.
+    """The scores of one or many images against both ground truths; ``sum(scores, Score())`` pools.
 
     Parameters
     ----------
@@ -174,27 +174,27 @@ def fill_background(disparity: ArrayLike) -> NDArray[np.float32]:
     Returns
     -------
     (H, W) float32
-        Values are copied, never computed. NaN remains on empty rows that lie between filled ones, and
-        everywhere if nothing was known.
+        Values are copied, never computed. NaN remains on empty rows between filled ones, and everywhere if no
+        pixel was known.
 
     Raises
     ------
     InputError
         If `disparity` is not a two-dimensional array of numbers.
     """
-    given = _as_map("disparity", disparity)
-    known = _known(given)
+    values = _as_map("disparity", disparity)
+    known = _known(values)
     rows = np.flatnonzero(known.any(axis=1))
-    out = np.full(given.shape, np.nan, np.float32)
+    out = np.full(values.shape, np.nan, np.float32)
     if not rows.size:
         return out
-    width = given.shape[1]
+    width = values.shape[1]
     line = np.arange(width)
     before = np.maximum.accumulate(np.where(known, line, -1), axis=1)
     after = np.minimum.accumulate(np.where(known, line, width)[:, ::-1], axis=1)[:, ::-1]
-    values = np.where(known, given, np.float32(np.nan))
-    left = np.where(before >= 0, np.take_along_axis(values, np.maximum(before, 0), axis=1), np.nan)
-    right = np.where(after < width, np.take_along_axis(values, np.minimum(after, width - 1), axis=1), np.nan)
+    known_values = np.where(known, values, np.float32(np.nan))
+    left = np.where(before >= 0, np.take_along_axis(known_values, np.maximum(before, 0), axis=1), np.nan)
+    right = np.where(after < width, np.take_along_axis(known_values, np.minimum(after, width - 1), axis=1), np.nan)
     out[:] = np.fmin(left, right)  # of two ends the smaller, of one end that one
     out[: rows[0]] = out[rows[0]]
     out[rows[-1] + 1 :] = out[rows[-1]]
@@ -202,7 +202,7 @@ def fill_background(disparity: ArrayLike) -> NDArray[np.float32]:
 
 
 def as_written(disparity: ArrayLike) -> NDArray[np.float32]:
-    """Return what is left of a map after the development kit wrote it to a 16-bit PNG and read it back.
+    """Return a map after a round trip through the development kit's 16-bit PNG.
 
     A known value becomes ``floor(max(256 * d, 1)) / 256``: steps of 1/256 px, rounded down, and a value below
     1/256 px becomes 1/256, because 0 marks the unknown.
@@ -220,14 +220,14 @@ def as_written(disparity: ArrayLike) -> NDArray[np.float32]:
     Raises
     ------
     InputError
-        If `disparity` is no map, or holds 256 px or more, which the format cannot.
+        If `disparity` is no map, or has values of 256 px or more, beyond the format's range.
     """
-    given = _as_map("disparity", disparity)
-    known = _known(given)
-    top = float(given[known].max()) if known.any() else 0.0
+    values = _as_map("disparity", disparity)
+    known = _known(values)
+    top = float(values[known].max()) if known.any() else 0.0
     if top >= 256.0:
         raise InputError(f"disparity must stay below 256 px for a 16-bit PNG, got {top:g}")
-    steps = np.floor(np.maximum(given.astype(np.float64) * 256.0, 1.0, where=known, out=np.ones(given.shape)))
+    steps = np.floor(np.maximum(values.astype(np.float64) * 256.0, 1.0, where=known, out=np.ones(values.shape)))
     return np.where(known, steps / 256.0, np.nan).astype(np.float32)
 
 
@@ -280,7 +280,7 @@ def score(
     objects : (H, W) array of integers, optional
         Object map: 0 is background, anything else foreground. Without it `bg` and `fg` stay empty.
     measured : (H, W) bool array, optional
-        Where `estimate` was measured, for a map that its matcher filled already. Known pixels, if not given.
+        Where `estimate` was measured, for a map that its matcher filled already. Known pixels by default.
 
     Returns
     -------
@@ -291,17 +291,17 @@ def score(
     InputError
         If a map is not two-dimensional or the sizes differ.
     """
-    given = _as_map("estimate", estimate)
-    known = _known(given)
-    filled = given if known.all() else fill_background(given)
+    values = _as_map("estimate", estimate)
+    known = _known(values)
+    filled = values if known.all() else fill_background(values)
     if measured is not None:
-        known = known & _same_size("measured", np.asarray(measured), given).astype(bool)
-    fg = None if objects is None else _same_size("objects", np.asarray(objects), given) != 0
-    # The map keeps -1 where even the fill found nothing.
+        known = known & _same_size("measured", np.asarray(measured), values).astype(bool)
+    fg = None if objects is None else _same_size("objects", np.asarray(objects), values) != 0
+    # Pixels that even the fill leaves unknown are -1.
     filled = np.where(_known(filled), filled, _EMPTY)
     return Score(
-        noc=_regions(filled, known, _truth("noc", noc, given), fg),
-        occ=_regions(filled, known, _truth("occ", occ, given), fg),
+        noc=_regions(filled, known, _truth("noc", noc, values), fg),
+        occ=_regions(filled, known, _truth("occ", occ, values), fg),
     )
 
 
@@ -313,20 +313,20 @@ def _regions(
 ) -> Regions:
     if truth is None:
         return Regions()
-    given = _known(truth)
-    true, had = truth[given], known[given]
-    error = np.abs(true - filled[given])
+    has_truth = _known(truth)
+    true_values, was_measured = truth[has_truth], known[has_truth]
+    error = np.abs(true_values - filled[has_truth])
 
     def count(where: NDArray[np.bool_] | None) -> Counts:
         if where is None:
-            return Counts(tally(error, true), tally(error[had], true[had]))
-        both = where & had
-        return Counts(tally(error[where], true[where]), tally(error[both], true[both]))
+            return Counts(tally(error, true_values), tally(error[was_measured], true_values[was_measured]))
+        both = where & was_measured
+        return Counts(tally(error[where], true_values[where]), tally(error[both], true_values[both]))
 
     if fg is None:
         return Regions(all=count(None))
-    front = fg[given]
-    return Regions(all=count(None), bg=count(~front), fg=count(front))
+    is_foreground = fg[has_truth]
+    return Regions(all=count(None), bg=count(~is_foreground), fg=count(is_foreground))
 
 
 def _known(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:

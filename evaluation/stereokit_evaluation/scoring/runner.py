@@ -47,12 +47,12 @@ class _Disparity(Protocol):
 
 
 Matching = Callable[[NDArray[Any], NDArray[Any]], _Disparity]
-"""What `run` calls with a left and a right image: `stereokit.Matcher`, or anything with its result."""
+"""A function of a left and a right image: `stereokit.Matcher`, or any other with its result."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A disparity map to score, (H, W) float32; where it was measured; and the seconds that it took."""
+    """A disparity map to score, (H, W) float32; the mask of its measured pixels; and the seconds of its matching."""
 
     disparity: NDArray[np.float32]
     measured: NDArray[np.bool_] | None = None
@@ -65,17 +65,17 @@ Observer = Callable[[Frame, Estimate, NDArray[np.float32] | None, NDArray[np.flo
 
 @dataclass(frozen=True)
 class Scored:
-    """One frame's counts, the seconds that its matching took, if any was run, and what looks wrong about it."""
+    """One frame's counts, the seconds of its matching, if any was run, and warnings about it."""
 
     name: str
     score: Score
     seconds: float | None = None
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """A frame that could not be scored, and why, in one line."""
+    """A frame that could not be scored, and the reason, in one line."""
 
     name: str
     reason: str
@@ -90,7 +90,7 @@ class Result:
     frames : tuple of Scored
         In the order of the run.
     skipped : tuple of Skipped
-        Those that could not be scored; they count nowhere.
+        Those that could not be scored; they are left out of all counts.
     """
 
     frames: tuple[Scored, ...] = ()
@@ -125,25 +125,25 @@ def run(
     progress : callable, optional
         Called after each frame with the number done, the number of all, and the frame's name.
     gray : bool
-        Give the matcher grey images (the default, as all published figures) rather than what the files hold.
+        Give the matcher grey images (the default, as for all published figures) rather than colour ones.
 
     Returns
     -------
     Result
         ``result.score.noc.all.filled.d1()`` is the pooled D1 error over non-occluded pixels.
     """
-    every = list(frames)
+    all_frames = list(frames)
     scored: list[Scored] = []
     skipped: list[Skipped] = []
-    for done, outcome in enumerate(score_frames(every, with_matcher(matcher, gray=gray)), start=1):
+    for count, outcome in enumerate(score_frames(all_frames, with_matcher(matcher, gray=gray)), start=1):
         if isinstance(outcome, Scored):
             scored.append(outcome)
-            for line in outcome.doubts:
+            for line in outcome.warnings:
                 warn(f"{outcome.name}: {line}", PairWarning)
         else:
             skipped.append(outcome)
         if progress is not None:
-            progress(done, len(every), outcome.name)
+            progress(count, len(all_frames), outcome.name)
     return Result(tuple(scored), tuple(skipped))
 
 
@@ -152,7 +152,7 @@ def score_frames(
     estimate: Estimator,
     observe: Observer | None = None,
 ) -> Iterator[Scored | Skipped]:
-    """Yield the outcome of each frame, one at a time, so that an interrupted run keeps what it has.
+    """Yield the outcome of each frame, one at a time, so that an interrupted run has its results so far.
 
     Parameters
     ----------
@@ -164,39 +164,39 @@ def score_frames(
     """
     for frame in frames:
         try:
-            with collecting() as doubts:
+            with collecting() as warnings:
                 noc, occ, objects = frame.load_noc(), frame.load_occ(), frame.load_objects()
                 if noc is None and occ is None:
-                    raise FileError("no ground truth found")
-                found = estimate(frame)
-                result = score(found.disparity, noc=noc, occ=occ, objects=objects, measured=found.measured)
+                    raise FileError("the frame has no ground truth")
+                result = estimate(frame)
+                scores = score(result.disparity, noc=noc, occ=occ, objects=objects, measured=result.measured)
         except (StereokitError, OSError) as error:
             yield Skipped(frame.name, one_line(str(error)))
             continue
         if observe is not None:
-            observe(frame, found, noc, occ)
-        yield Scored(frame.name, result, found.seconds, tuple(doubts))
+            observe(frame, result, noc, occ)
+        yield Scored(frame.name, scores, result.seconds, tuple(warnings))
 
 
 def seen_in_training(matcher: object, dataset: str, frames: Iterable[Frame]) -> str | None:
-    """Return a line that says how many of the frames a matcher's refiner was trained on, None if on none.
+    """Return a line with the number of frames that a matcher's refiner was trained on, None for none.
 
     Parameters
     ----------
     matcher : object
-        A `stereokit.Matcher`, whose refiner may tell what it was ``trained_on``.
+        A `stereokit.Matcher`, whose refiner may have the attribute ``trained_on``.
     dataset : str
         Name of the data set that the frames are of.
     frames : iterable of Frame
     """
     refiner = getattr(matcher, "refine", None)
-    known: frozenset[str] = getattr(refiner, "trained_on", frozenset())
-    every = list(frames)
-    seen = sum(f"{dataset}/{frame.name}" in known for frame in every)
-    if not seen:
+    training_frames: frozenset[str] = getattr(refiner, "trained_on", frozenset())
+    all_frames = list(frames)
+    count = sum(f"{dataset}/{frame.name}" in training_frames for frame in all_frames)
+    if not count:
         return None
     name = getattr(matcher, "refiner", None)
-    return f"refiner {name!r} was trained on {seen} of these {len(every)} frames: on those its errors say little"
+    return f"refiner {name!r} was trained on {count} of these {len(all_frames)} frames: on those its errors say little"
 
 
 def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:
@@ -213,9 +213,9 @@ def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:
                 matcher(left, right)
             warm = True
         start = time.perf_counter()
-        found = matcher(left, right)
+        result = matcher(left, right)
         seconds = time.perf_counter() - start
-        return Estimate(np.asarray(found.disparity), np.asarray(found.valid), seconds)
+        return Estimate(np.asarray(result.disparity), np.asarray(result.valid), seconds)
 
     return estimate
 

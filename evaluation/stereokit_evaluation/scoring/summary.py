@@ -1,6 +1,6 @@
-"""The figures of a scored run as every command writes them to JSON: percent and pixels, pooled over images.
+"""The summary of a scored run, in the JSON of every command: percent and pixels, pooled over images.
 
-None (null) stands where ground truth is missing.
+Values without ground truth are None (null).
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from typing import Any
 from stereokit_evaluation.scoring.kitti import THRESHOLDS, Regions, Tally
 from stereokit_evaluation.scoring.runner import Result
 
-__all__ = ["d1", "figures"]
+__all__ = ["d1", "summary"]
 
 
-def figures(result: Result) -> dict[str, Any]:
-    """Return everything that a run scored.
+def summary(result: Result) -> dict[str, Any]:
+    """Return the scores of a run.
 
     Parameters
     ----------

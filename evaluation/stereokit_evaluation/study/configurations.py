@@ -1,10 +1,10 @@
-"""The grid of the robustness study: matchers times settings, each with all that its results depend on.
+"""The configurations of the robustness study: each matcher in each variant, with everything its results depend on.
 
-Settings are those of the StereoVAE paper, section "Robustness": *Original* matches at full size; *Mini+X* matches at
-half size and lets the refiner X bring the map to full size. *Mini+CNN* is the paper's network without the latent
-sampling ("non-VAE" in its table II). Any other registered refiner joins as a further setting.
+The variants are the settings of the StereoVAE paper, section "Robustness": *Original* matches at full size; *Mini+X*
+matches at half size and the refiner X brings the map to full size. *Mini+CNN* is the paper's network without the latent
+sampling ("non-VAE" in its table II). Any other registered refiner is a further variant.
 
-A refiner that is not installed, or whose runtime is not, leaves its configurations in the grid with the reason.
+A refiner that is not installed, or whose runtime is not, leaves its configurations in the list, with the reason.
 """
 
 from __future__ import annotations
@@ -25,152 +25,154 @@ from stereokit.errors import FileError, OptionError, UnknownNameError, did_you_m
 from stereokit.matching import METHODS, Matcher
 from stereokit.methods import find_refiner, option_names, parse_method
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
-from stereokit_evaluation.bench import peers
+from stereokit_evaluation.bench import baselines
 from stereokit_evaluation.common.weights import needs_weights
 from stereokit_evaluation.scoring.runner import Matching
 
 __all__ = [
-    "PAPER_SETTINGS",
-    "PEER",
+    "BASELINE",
+    "PAPER_VARIANTS",
     "Configuration",
+    "available_variants",
+    "baseline",
     "build",
     "describe_error",
     "fingerprint",
-    "parse_setting",
-    "peer",
-    "settings_at_hand",
+    "parse_variant",
     "title",
 ]
 
-PAPER_SETTINGS = {"linear": "Mini+Linear", "original": "Original", "cnn": "Mini+CNN", "stereovae": "Mini+StereoVAE"}
-"""The paper's settings, by the names that ``--setting`` takes."""
-PEER = "peer"
-"""The setting of another library's matcher."""
+PAPER_VARIANTS = {"linear": "Mini+Linear", "original": "Original", "cnn": "Mini+CNN", "stereovae": "Mini+StereoVAE"}
+"""The paper's variants, by the names that ``--variant`` takes."""
+BASELINE = "peer"
+"""The variant of another library's matcher."""
 
-_NO_SETTINGS = ("auto", "file", "general")  # choose among others, take a path, are another's second name
+_NO_VARIANTS = ("auto", "file", "general")  # choose among others, take a path, are another's second name
 
 Trained = Mapping[tuple[str, str], Any]
-"""Method and setting to what `stereokit.Matcher` takes as its refiner: a weight file, or a refiner."""
+"""Method and variant to the refiner of `stereokit.Matcher`: a weight file, or a refiner object."""
 
 
 @dataclass(frozen=True, eq=False)
 class Configuration:
-    """One cell of the grid.
+    """A method in a variant.
 
     Attributes
     ----------
     method : str
-        ``"zncc+sgm"``, or a peer's name.
+        ``"zncc+sgm"``, or the name of a baseline.
     label : str
         ``"S4"``, or the method where it has no short name.
-    setting : str
-        A key of `PAPER_SETTINGS`, another refiner's name, or `PEER`.
+    variant : str
+        A key of `PAPER_VARIANTS`, another refiner's name, or `BASELINE`.
     matcher : callable or None
-        What is called; None if it cannot be built.
+        The function of two images; None if it cannot be built.
     identity : dict
-        All that its maps depend on beside the images: resolved options, weights, source.
+        Everything its maps depend on, except the images: resolved options, weights, source.
     missing : str or None
         Why it cannot be built, in one line.
     """
 
     method: str
     label: str
-    setting: str
+    variant: str
     matcher: Matching | None = None
     identity: dict[str, Any] = field(default_factory=dict)
     missing: str | None = None
 
     @property
     def name(self) -> str:
-        """Its name for people: ``"S4 Mini+Linear"``."""
-        return self.label if self.setting == PEER else f"{self.label} {title(self.setting)}"
+        """The name in tables: ``"S4 Mini+Linear"``."""
+        return self.label if self.variant == BASELINE else f"{self.label} {title(self.variant)}"
 
     @property
     def scale(self) -> float:
-        """The size at which it matches."""
-        return 1.0 if self.setting in ("original", PEER) else 0.5
+        """The size of the matching."""
+        return 1.0 if self.variant in ("original", BASELINE) else 0.5
 
 
-def title(setting: str) -> str:
-    """Return what tables call a setting: ``"Mini+CNN"``."""
-    return PAPER_SETTINGS.get(setting) or f"Mini+{Path(setting).stem if _is_file(setting) else setting}"
+def title(variant: str) -> str:
+    """Return the title of a variant in tables: ``"Mini+CNN"``."""
+    return PAPER_VARIANTS.get(variant) or f"Mini+{Path(variant).stem if _is_file(variant) else variant}"
 
 
-def settings_at_hand() -> list[str]:
-    """Return the paper's settings and one for each further refiner that is registered."""
-    return [*PAPER_SETTINGS, *(n for n in REFINERS.names() if n not in PAPER_SETTINGS and n not in _NO_SETTINGS)]
+def available_variants() -> list[str]:
+    """Return the paper's variants and one for each further registered refiner."""
+    return [*PAPER_VARIANTS, *(n for n in REFINERS.names() if n not in PAPER_VARIANTS and n not in _NO_VARIANTS)]
 
 
-def parse_setting(text: str) -> str:
-    """Return the setting called `text`: ``"original"``, a refiner, ``"Mini+REFINER"``, or a weight file.
+def parse_variant(text: str) -> str:
+    """Return the variant named `text`: ``"original"``, a refiner, ``"Mini+REFINER"``, or a weight file.
 
     Raises
     ------
     UnknownNameError
-        If the paper has no such setting and no such refiner is registered.
+        If the paper has no such variant and no such refiner is registered.
     FileError
         If there is no such weight file.
     """
     if _is_file(text):
         if not Path(text).is_file():
-            raise FileError(f"setting must name a weight file that exists, got {text!r}")
+            raise FileError(f"variant must name a weight file that exists, got {text!r}")
         return text
-    known = settings_at_hand()
+    known = available_variants()
     name = text.strip().lower().removeprefix("mini+")
     if name not in known:
-        raise UnknownNameError(did_you_mean("setting", text, known))
+        raise UnknownNameError(did_you_mean("variant", text, known))
     return name
 
 
 def build(
     methods: Sequence[str],
-    settings: Sequence[str],
+    variants: Sequence[str],
     options: Mapping[str, Any],
     trained: Trained | None = None,
 ) -> list[Configuration]:
-    """Return the grid, matcher by matcher, in the order given.
+    """Return the configurations, matcher by matcher, in the order of the arguments.
 
     Parameters
     ----------
     methods : sequence of str
-        Methods, in any of their forms.
-    settings : sequence of str
-        As `parse_setting` returns them.
+        Methods, by any of their names.
+    variants : sequence of str
+        As `parse_variant` returns them.
     options : mapping
-        Options of `stereokit.Matcher`. An option of a stage, or of a refiner, goes to those that have it only.
+        Options of `stereokit.Matcher`. An option of a stage, or of a refiner, applies only where it exists.
     trained : mapping, optional
-        Refiners that were trained for one method: (method, setting) to a weight file or a refiner.
+        Refiners that were trained for one method: (method, variant) to a weight file or a refiner.
 
     Raises
     ------
     OptionError
         If no chosen method knows an option, or one refuses its value.
     """
-    names = list(dict.fromkeys(parse_method(method) for method in methods))
+    method_names = list(dict.fromkeys(parse_method(method) for method in methods))
     for option in options:
-        if all(option in _foreign(name) for name in names):
-            raise OptionError(f"option {option!r} must belong to a chosen method, got {', '.join(names)}")
-    learned = {setting: _refiner_options(setting) for setting in settings}
-    everywhere = {option for names_ in learned.values() for option in names_}
-    without_weights = {setting for setting in settings if learned[setting] and needs_weights(setting)}
+        if all(option in _foreign(name) for name in method_names):
+            raise OptionError(f"option {option!r} must belong to a chosen method, got {', '.join(method_names)}")
+    refiner_options = {variant: _refiner_options(variant) for variant in variants}
+    all_refiner_options = {option for names_ in refiner_options.values() for option in names_}
+    without_weights = {variant for variant in variants if refiner_options[variant] and needs_weights(variant)}
 
-    def fitting(name: str, setting: str) -> dict[str, Any]:
-        left_out = _foreign(name) | everywhere - learned[setting]
-        if setting not in without_weights or (name, setting) in (trained or {}):
-            left_out |= {"weights"}
-        return {option: value for option, value in options.items() if option not in left_out}
+    def options_of(name: str, variant: str) -> dict[str, Any]:
+        excluded = _foreign(name) | all_refiner_options - refiner_options[variant]
+        if variant not in without_weights or (name, variant) in (trained or {}):
+            excluded |= {"weights"}
+        return {option: value for option, value in options.items() if option not in excluded}
 
+    weights = trained or {}
     return [
-        _configure(name, setting, fitting(name, setting), learned[setting], (trained or {}).get((name, setting)))
-        for name in names
-        for setting in dict.fromkeys(settings)
+        _configure(name, variant, options_of(name, variant), refiner_options[variant], weights.get((name, variant)))
+        for name in method_names
+        for variant in dict.fromkeys(variants)
     ]
 
 
-def peer(key: str, levels: int) -> Configuration:
-    """Return another library's matcher as a configuration: `key` is one of `stereokit_evaluation.bench.peers`."""
-    identity = {"peer": key, "levels": levels, "opencv": cv2.__version__, "source": fingerprint(Path(peers.__file__))}
-    return Configuration(key, key, PEER, peers.padded(key, levels), identity)
+def baseline(key: str, levels: int) -> Configuration:
+    """Return another library's matcher as a configuration: `key` is one of `stereokit_evaluation.bench.baselines`."""
+    source = fingerprint(Path(baselines.__file__))
+    identity = {"peer": key, "levels": levels, "opencv": cv2.__version__, "source": source}
+    return Configuration(key, key, BASELINE, baselines.padded(key, levels), identity)
 
 
 @cache
@@ -200,33 +202,33 @@ def describe_error(error: BaseException) -> str:
 
 
 def _configure(
-    method: str, setting: str, options: dict[str, Any], learned: frozenset[str], trained: Any
+    method: str, variant: str, options: dict[str, Any], refiner_options: frozenset[str], trained: Any
 ) -> Configuration:
     label = next((short for short, name in METHODS.items() if name == method), method)
-    if setting == "original":
+    if variant == "original":
         matcher = Matcher(method, **options)
-        return Configuration(method, label, setting, matcher, _identity(matcher))
+        return Configuration(method, label, variant, matcher, _identity(matcher))
     # A bad option is the user's, and no reason to call a refiner missing.
-    Matcher(method, scale=0.5, **{name: value for name, value in options.items() if name not in learned})
-    if trained is None and not _is_file(setting) and setting not in REFINERS.names():
-        return Configuration(method, label, setting, missing=f"no refiner named {setting!r} is installed")
+    Matcher(method, scale=0.5, **{name: value for name, value in options.items() if name not in refiner_options})
+    if trained is None and not _is_file(variant) and variant not in REFINERS.names():
+        return Configuration(method, label, variant, missing=f"no refiner named {variant!r} is installed")
     try:
-        matcher = Matcher(method, scale=0.5, refiner=setting if trained is None else trained, **options)
-        return Configuration(method, label, setting, matcher, _identity(matcher))
+        matcher = Matcher(method, scale=0.5, refiner=variant if trained is None else trained, **options)
+        return Configuration(method, label, variant, matcher, _identity(matcher))
     except Exception as error:  # a plug-in's own trouble: weights or a runtime that are not there
-        return Configuration(method, label, setting, missing=describe_error(error))
+        return Configuration(method, label, variant, missing=describe_error(error))
 
 
-def _is_file(setting: str) -> bool:
-    return setting.lower().endswith(".safetensors")
+def _is_file(variant: str) -> bool:
+    return variant.lower().endswith(".safetensors")
 
 
-def _refiner_options(setting: str) -> frozenset[str]:
+def _refiner_options(variant: str) -> frozenset[str]:
     """Return the names of a refiner's own options; of one that cannot be loaded, none."""
-    if setting == "original":
+    if variant == "original":
         return frozenset()
     try:
-        return frozenset(find_refiner(setting)[2])
+        return frozenset(find_refiner(variant)[2])
     except Exception:
         return frozenset()
 
@@ -243,16 +245,16 @@ def _identity(matcher: Matcher) -> dict[str, Any]:
 
 
 def _weights(refiner: Any) -> dict[str, str]:
-    """Return what tells one refiner from another: its own fingerprint or its looks, and the files that it came in."""
-    given = getattr(refiner, "fingerprint", None)
-    given = given() if callable(given) else given
+    """Return the identity of a refiner: its own fingerprint or its ``repr``, and a digest of its source files."""
+    own_fingerprint = getattr(refiner, "fingerprint", None)
+    own_fingerprint = own_fingerprint() if callable(own_fingerprint) else own_fingerprint
     module = sys.modules.get(type(refiner).__module__.partition(".")[0])
     file = getattr(module, "__file__", None)
     source = ""
     if file is not None:  # a package is its folder, a module its file alone
-        place = Path(file).parent if hasattr(module, "__path__") else Path(file)
-        source = fingerprint(place, everything=given is None)
-    return {"weights": _stable(refiner) if given is None else str(given), "source": source}
+        path = Path(file).parent if hasattr(module, "__path__") else Path(file)
+        source = fingerprint(path, everything=own_fingerprint is None)
+    return {"weights": _stable(refiner) if own_fingerprint is None else str(own_fingerprint), "source": source}
 
 
 def _stable(value: Any) -> str:
@@ -264,5 +266,5 @@ def _foreign(method: str) -> set[str]:
     """Return the names of options that only stages of other methods have."""
     cost, aggregation = method.split("+")
     stages = [COSTS.get(name) for name in COSTS.names()] + [AGGREGATIONS.get(name) for name in AGGREGATIONS.names()]
-    own = {*option_names(COSTS.get(cost)), *option_names(AGGREGATIONS.get(aggregation))}
-    return {name for stage in stages for name in option_names(stage)} - own
+    own_names = {*option_names(COSTS.get(cost)), *option_names(AGGREGATIONS.get(aggregation))}
+    return {name for stage in stages for name in option_names(stage)} - own_names

@@ -1,10 +1,10 @@
-"""The loop of the study: every frame through every configuration, timed, scored and kept.
+"""The loop of the study: every frame through every configuration, timed, scored and stored.
 
-Frames are the outer loop: a pair is loaded once, all configurations take turns on it (so that a busy machine harms
-all alike), and an interrupt leaves the same frames for all. Each configuration is called once to warm up; on each
+Frames are the outer loop: a pair is loaded once and all configurations take turns on it, so that a busy machine harms
+all alike, and an interrupt leaves the same frames for all. Each configuration is called once to warm up; on each
 frame it is then called `repeats` times, and the median counts.
 
-A frame that one configuration cannot do is left out for all: the figures of the rows stay comparable.
+A frame that fails in one configuration is left out for all, so that the rows stay comparable.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring import kitti
 from stereokit_evaluation.scoring.kitti import score
 from stereokit_evaluation.scoring.runner import Result, Scored, Skipped
-from stereokit_evaluation.study.configurations import PEER, Configuration, describe_error, fingerprint, title
+from stereokit_evaluation.study.configurations import BASELINE, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
 
-__all__ = ["Row", "Study", "measure", "run_study"]
+__all__ = ["Study", "StudyRow", "measure", "run_study"]
 
 Clock = Callable[[], float]
 
-_HOPELESS = 3  # frames that a configuration fails on, before any that it can do, until it is given up
+_MAX_FAILURES = 3  # first frames that all fail in a configuration, until it is given up
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class StudyRow:
     """One configuration's results.
 
     Attributes
@@ -52,7 +52,7 @@ class Row:
     ms : dict of str to float
         Milliseconds a frame, in all and by group of stages: medians over the frames of `result`.
     missing : str or None
-        Why there are no results.
+        The reason why there are no results.
     """
 
     configuration: Configuration
@@ -63,29 +63,29 @@ class Row:
 
 @dataclass
 class Study:
-    """All that a run found.
+    """The results of a run.
 
     Attributes
     ----------
     rows : list of Row
         In the order of the configurations.
     skipped : list of Skipped
-        Frames that count nowhere, each once, with the first reason.
+        Frames that are left out, each once, with the first reason.
     reused, computed : int
-        Records that were read from the store, and that were made.
+        Numbers of records from the store, and of new ones.
     interrupted : bool
-        Whether the user ended it.
+        Whether the user interrupted it.
     """
 
-    rows: list[Row] = field(default_factory=list)
+    rows: list[StudyRow] = field(default_factory=list)
     skipped: list[Skipped] = field(default_factory=list)
     reused: int = 0
     computed: int = 0
     interrupted: bool = False
 
 
-class _Loaded:
-    """A frame's images and ground truth, read when first asked for and once."""
+class _LoadedFrame:
+    """A frame's images and ground truth, read once, at their first use."""
 
     def __init__(self, frame: Frame, gray: bool) -> None:
         self.frame = frame
@@ -110,12 +110,12 @@ class _Loaded:
     @cached_property
     def digest(self) -> str:
         if self.frame.noc is None and self.frame.occ is None:
-            raise FileError("no ground truth found")
+            raise FileError("the frame has no ground truth")
         return frame_digest(self.frame)
 
 
 def run_study(
-    every: Iterable[Frame],
+    all_frames: Iterable[Frame],
     configurations: Sequence[Configuration],
     store: Store,
     *,
@@ -123,13 +123,13 @@ def run_study(
     gray: bool = True,
     about_times: Any = None,
     step: Callable[[str, int], None] = lambda text, advance: None,
-    tell: Callable[[str], None] = lambda line: None,
+    report: Callable[[str], None] = lambda line: None,
 ) -> Study:
-    """Measure and score all configurations on all frames, but for what the store has.
+    """Measure and score all configurations on all frames, except for those in the store.
 
     Parameters
     ----------
-    every : iterable of Frame
+    all_frames : iterable of Frame
     configurations : sequence of Configuration
         Those without a matcher are reported as missing.
     store : Store
@@ -138,16 +138,16 @@ def run_study(
     gray : bool
         Give grey images.
     about_times : any
-        What times depend on beside the configuration: threads, processor.
+        Further conditions of the times: threads, processor.
     step : callable
-        Called with a few words and the number of steps taken, before each configuration of each frame.
-    tell : callable
+        Called with a short text and a number of steps, before each configuration of each frame.
+    report : callable
         Called with one line for each frame that is left out.
 
     Returns
     -------
     Study
-        An interrupt (KeyboardInterrupt) ends the work and keeps what was done.
+        An interrupt (KeyboardInterrupt) ends the work; the results so far are returned.
 
     Raises
     ------
@@ -156,29 +156,29 @@ def run_study(
     """
     study = Study()
     missing = {index: c.missing or "" for index, c in enumerate(configurations) if c.matcher is None}
-    done: dict[int, dict[str, Record]] = {index: {} for index in range(len(configurations)) if index not in missing}
-    failed: dict[str, list[tuple[int | None, str]]] = {}
+    records: dict[int, dict[str, Record]] = {index: {} for index in range(len(configurations)) if index not in missing}
+    failures: dict[str, list[tuple[int | None, str]]] = {}
     warm: set[int] = set()
 
     def fail(frame: Frame, index: int | None, reason: str) -> None:
-        tell(f"skipped {frame.name}: {_named(configurations, index, reason)}")
-        failed.setdefault(frame.name, []).append((index, reason))
-        if index is not None and not done[index] and _times_failed(failed, index) == _HOPELESS:
+        report(f"skipped {frame.name}: {_named(configurations, index, reason)}")
+        failures.setdefault(frame.name, []).append((index, reason))
+        if index is not None and not records[index] and _times_failed(failures, index) == _MAX_FAILURES:
             missing[index] = reason  # and its frames count again
 
     common = [_source(), repeats, gray, about_times]
     try:
-        for frame in every:
-            loaded, doubts = _Loaded(frame, gray), list[str]()
+        for frame in all_frames:
+            loaded, warnings = _LoadedFrame(frame, gray), list[str]()
             step(frame.name, sum(index in missing for index in range(len(configurations))))
             for index, configuration in enumerate(configurations):
                 if index in missing:
                     continue
                 step(f"{frame.name}: {configuration.name}", 1)
-                place = f"{configuration.label}/{title(configuration.setting)}/{frame.name}"
+                path = f"{configuration.label}/{title(configuration.variant)}/{frame.name}"
                 try:
                     key = digest([loaded.digest, configuration.identity, *common])
-                    record = store.get(place, key)
+                    record = store.get(path, key)
                     if record is None:
                         _ = loaded.images, loaded.truth  # here, because trouble with these is the frame's
                 except (StereokitError, OSError) as error:
@@ -188,24 +188,24 @@ def run_study(
                     try:
                         with collecting() as lines:
                             record = measure(configuration, loaded, repeats, warm=index in warm)
-                        doubts += lines
-                    except ImportError as error:  # a refiner's runtime, asked for at its first call
+                        warnings += lines
+                    except ImportError as error:  # a refiner's runtime, imported at its first call
                         missing[index] = describe_error(error)
                         continue
                     except Exception as error:  # a plug-in's slip must not end a long run
                         fail(frame, index, describe_error(error))
                         continue
                     warm.add(index)
-                    store.put(place, key, record, {"frame": frame.name, "identity": configuration.identity})
+                    store.put(path, key, record, {"frame": frame.name, "identity": configuration.identity})
                     study.computed += 1
                 else:
                     study.reused += 1
-                done[index][frame.name] = record
-            for line in doubts[:1]:
-                tell(f"warning: {frame.name}: {line}")
+                records[index][frame.name] = record
+            for line in warnings[:1]:
+                report(f"warning: {frame.name}: {line}")
     except KeyboardInterrupt:
         study.interrupted = True
-    _pool(study, configurations, done, missing, failed)
+    _pool(study, configurations, records, missing, failures)
     return study
 
 
@@ -223,7 +223,7 @@ def measure(
     repeats : int
         Timed calls.
     warm : bool
-        Whether the matcher was called before; if not, it is, untimed.
+        Whether the matcher was called before; if not, it is called once untimed.
     clock : callable
         Returns seconds.
     """
@@ -236,18 +236,18 @@ def measure(
     runs: list[dict[str, float]] = []
     for _ in range(repeats):
         timer = StageTimer(clock, groups=True)
-        if configuration.setting == PEER:
-            begun = clock()
-            found = matcher(left, right)
-            runs.append({TOTAL: clock() - begun})
+        if configuration.variant == BASELINE:
+            start = clock()
+            result = matcher(left, right)
+            runs.append({TOTAL: clock() - start})
             continue
         with observed(timer):
-            begun = clock()
-            found = matcher(left, right)
-            total = clock() - begun
-        known = {group: timer.seconds.get(group, 0.0) for group in GROUPS}
-        runs.append({TOTAL: total, **known, OTHER: total - sum(known.values())})
-    counts = score(np.asarray(found.disparity), **truth, measured=np.asarray(found.valid))
+            start = clock()
+            result = matcher(left, right)
+            total = clock() - start
+        group_seconds = {group: timer.seconds.get(group, 0.0) for group in GROUPS}
+        runs.append({TOTAL: total, **group_seconds, OTHER: total - sum(group_seconds.values())})
+    counts = score(np.asarray(result.disparity), **truth, measured=np.asarray(result.valid))
     return Record(counts, {name: 1e3 * median(run[name] for run in runs) for name in runs[0]})
 
 
@@ -255,12 +255,12 @@ def _named(configurations: Sequence[Configuration], index: int | None, reason: s
     return reason if index is None else f"{configurations[index].name}: {reason}"
 
 
-def _times_failed(failed: dict[str, list[tuple[int | None, str]]], index: int) -> int:
-    return sum(cause == index for causes in failed.values() for cause, _ in causes)
+def _times_failed(failures: dict[str, list[tuple[int | None, str]]], index: int) -> int:
+    return sum(cause == index for causes in failures.values() for cause, _ in causes)
 
 
 def _source() -> list[str]:
-    """Return what scores and times depend on in this package."""
+    """Return the digests of the modules that scores and times depend on."""
     modules = (datasets.__file__, frames.__file__, kitti.__file__, __file__)
     return [fingerprint(Path(str(file))) for file in modules]
 
@@ -268,28 +268,28 @@ def _source() -> list[str]:
 def _pool(
     study: Study,
     configurations: Sequence[Configuration],
-    done: dict[int, dict[str, Record]],
+    all_records: dict[int, dict[str, Record]],
     missing: dict[int, str],
-    failed: dict[str, list[tuple[int | None, str]]],
+    failures: dict[str, list[tuple[int | None, str]]],
 ) -> None:
     """Build the rows over the frames that all configurations scored; one that scored none is missing."""
-    some = {name for records in done.values() for name in records}
-    for index, records in done.items():
-        if index not in missing and not records and some:
-            reasons = [reason for causes in failed.values() for cause, reason in causes if cause == index]
+    scored_names = {name for records in all_records.values() for name in records}
+    for index, records in all_records.items():
+        if index not in missing and not records and scored_names:
+            reasons = [reason for causes in failures.values() for cause, reason in causes if cause == index]
             missing[index] = reasons[0] if reasons else "interrupted before its first frame"
-    present = [records for index, records in done.items() if index not in missing]
-    shared = [name for name in (present[0] if present else ()) if all(name in records for records in present)]
-    for name, causes in failed.items():
-        told = [_named(configurations, cause, reason) for cause, reason in causes if cause not in missing]
-        if told:
-            study.skipped.append(Skipped(name, told[0]))
+    complete = [records for index, records in all_records.items() if index not in missing]
+    shared_names = [name for name in (complete[0] if complete else ()) if all(name in records for records in complete)]
+    for name, causes in failures.items():
+        reasons = [_named(configurations, cause, reason) for cause, reason in causes if cause not in missing]
+        if reasons:
+            study.skipped.append(Skipped(name, reasons[0]))
     for index, configuration in enumerate(configurations):
         if index in missing:
-            study.rows.append(Row(configuration, Result(), {}, missing[index]))
+            study.rows.append(StudyRow(configuration, Result(), {}, missing[index]))
             continue
-        records = {name: done[index][name] for name in shared}
+        records = {name: all_records[index][name] for name in shared_names}
         scored = tuple(Scored(name, r.score, r.ms[TOTAL] / 1e3) for name, r in records.items())
         names = list(next(iter(records.values())).ms) if records else []
         ms = {name: median(record.ms[name] for record in records.values()) for name in names}
-        study.rows.append(Row(configuration, Result(scored), ms))
+        study.rows.append(StudyRow(configuration, Result(scored), ms))

@@ -32,7 +32,7 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class Record:
-    """What is kept of one configuration on one frame.
+    """The stored result of one configuration on one frame.
 
     Attributes
     ----------
@@ -47,12 +47,12 @@ class Record:
 
 
 class Store:
-    """A folder of records; with None it keeps nothing.
+    """A folder of records; with None it stores nothing.
 
     Parameters
     ----------
     folder : Path or None
-        Made when first written to.
+        Created at the first record.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -64,7 +64,7 @@ class Store:
         Parameters
         ----------
         path : str
-            For people: matcher, setting and frame, such as ``"S4/original/000000_10"``.
+            The readable part of the name: matcher, variant and frame, such as ``"S4/original/000000_10"``.
         key : str
             The digest of what the record depends on.
         """
@@ -79,7 +79,7 @@ class Store:
             return None
 
     def put(self, path: str, key: str, record: Record, about: Mapping[str, Any]) -> None:
-        """Write a record, and with it `about`, which says what the key stands for.
+        """Write a record, and with it `about`, the plain content of the key.
 
         Raises
         ------
@@ -101,7 +101,7 @@ class Store:
 
 
 def digest(content: Any) -> str:
-    """Return the SHA-256 of anything that JSON can say, as hexadecimal digits."""
+    """Return the SHA-256 of a JSON value, as hexadecimal digits."""
     text = json.dumps([_FORMAT, content], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -109,33 +109,33 @@ def digest(content: Any) -> str:
 def frame_digest(frame: Frame) -> str:
     """Return the SHA-256 of a frame's content: its images and its ground truth.
 
-    Files are read as they are, without decoding; what a function makes is made and read.
+    Files are read without decoding; functions are called, and their arrays are read.
 
     Raises
     ------
     FileError
         If a file cannot be read.
     """
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for name in ("left", "right", "noc", "occ", "objects"):
-        found.update(f"\\0{name}\\0".encode())
-        _feed(found, getattr(frame, name))
-    return found.hexdigest()
+        hasher.update(f"\\0{name}\\0".encode())
+        _feed(hasher, getattr(frame, name))
+    return hasher.hexdigest()
 
 
-def _feed(found: Any, source: Any) -> None:
+def _feed(hasher: Any, source: Any) -> None:
     """Add a source's content: a file's bytes, the parts of a partial function, an array."""
     if isinstance(source, Path):
-        found.update(hashlib.sha256(read_bytes(source)).digest())
+        hasher.update(hashlib.sha256(read_bytes(source)).digest())
     elif isinstance(source, partial):
-        found.update(source.func.__qualname__.encode())
+        hasher.update(source.func.__qualname__.encode())
         for part in (*source.args, *source.keywords.values()):
-            _feed(found, part)
+            _feed(hasher, part)
     elif callable(source):
         array = np.ascontiguousarray(source())
-        found.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+        hasher.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
     else:
-        found.update(repr(source).encode())
+        hasher.update(repr(source).encode())
 
 
 def _score(content: Mapping[str, Any]) -> Score:

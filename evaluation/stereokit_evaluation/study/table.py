@@ -1,4 +1,4 @@
-"""The study's results as tables on the terminal and as JSON, the paper's published figures beside ours."""
+"""The study's results as tables on the terminal and as JSON, with the paper's published figures."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from rich.console import Console
 from stereokit.cli.output import Table
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL
 from stereokit_evaluation.data import published
-from stereokit_evaluation.scoring.summary import figures
-from stereokit_evaluation.study.configurations import PEER, title
-from stereokit_evaluation.study.run import Row, Study
+from stereokit_evaluation.scoring.summary import summary
+from stereokit_evaluation.study.configurations import BASELINE, title
+from stereokit_evaluation.study.run import Study, StudyRow
 
-__all__ = ["as_json", "missing_lines", "print_tables", "published_beside"]
+__all__ = ["as_json", "missing_lines", "print_tables", "published_values"]
 
 _D1 = [(region, part) for region in ("noc", "occ") for part in ("all", "bg", "fg")]
 _WIDTH = 130
 
 
-def published_beside(row: Row) -> dict[str, float | None]:
+def published_values(row: StudyRow) -> dict[str, float | None]:
     """Return the paper's figures for one row: percent by fig. e4 and e5, milliseconds by table II."""
-    label, setting = row.configuration.label, row.configuration.setting
+    label, variant = row.configuration.label, row.configuration.variant
     return {
-        "validation_d1": published.VALIDATION.get(label, {}).get(setting),
-        "test_d1_noc": published.TEST.get(label, {}).get(setting),
-        "agx_ms": published.agx_ms(label, setting),
+        "validation_d1": published.VALIDATION.get(label, {}).get(variant),
+        "test_d1_noc": published.TEST.get(label, {}).get(variant),
+        "agx_ms": published.agx_ms(label, variant),
     }
 
 
 def as_json(study: Study) -> dict[str, Any]:
-    """Return all rows, with what is published beside them; figures are None where nothing was scored."""
+    """Return all rows with the published values; scores are None where nothing was scored."""
     return {
         "results": [
             {
                 "matcher": row.configuration.label,
-                "setting": title(row.configuration.setting) if row.configuration.setting != PEER else PEER,
+                "setting": title(row.configuration.variant) if row.configuration.variant != BASELINE else BASELINE,
                 "method": row.configuration.method,
                 "scale": row.configuration.scale,
-                "refiner": None if row.configuration.setting in ("original", PEER) else row.configuration.setting,
+                "refiner": None if row.configuration.variant in ("original", BASELINE) else row.configuration.variant,
                 "device": str(getattr(row.configuration.matcher, "device", "cpu")),
                 "missing": row.missing,
-                **figures(row.result),
+                **summary(row.result),
                 "ms": row.ms,
-                "published": published_beside(row),
+                "published": published_values(row),
             }
             for row in study.rows
         ],
@@ -56,21 +56,21 @@ def as_json(study: Study) -> dict[str, Any]:
     }
 
 
-def missing_lines(rows: Sequence[Row]) -> list[str]:
-    """Return one line for each setting that is missing, and why."""
-    found: dict[tuple[str, str], list[str]] = {}
+def missing_lines(rows: Sequence[StudyRow]) -> list[str]:
+    """Return one line for each missing variant, with the reason."""
+    labels_by_reason: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row.missing is not None:
-            setting = row.configuration.setting
-            found.setdefault((setting, row.missing), []).append(row.configuration.label)
+            variant = row.configuration.variant
+            labels_by_reason.setdefault((variant, row.missing), []).append(row.configuration.label)
     return [
-        f"missing: {', '.join(labels)}{'' if setting == PEER else ' ' + title(setting)}: {reason}"
-        for (setting, reason), labels in found.items()
+        f"missing: {', '.join(labels)}{'' if variant == BASELINE else ' ' + title(variant)}: {reason}"
+        for (variant, reason), labels in labels_by_reason.items()
     ]
 
 
 def print_tables(heading: str, study: Study, note: str) -> None:
-    """Print accuracy, then times, then what is missing."""
+    """Print accuracy, then times, then the missing variants."""
     console = Console(width=None if sys.stdout.isatty() else _WIDTH)
     console.print(_accuracy(heading, study.rows))
     console.print(_times(study.rows))
@@ -78,36 +78,36 @@ def print_tables(heading: str, study: Study, note: str) -> None:
         console.print(line, markup=False, highlight=False)
 
 
-def _accuracy(heading: str, rows: Sequence[Row]) -> Table:
+def _accuracy(heading: str, rows: Sequence[StudyRow]) -> Table:
     table = _table(f"{heading}: D1 in percent, EPE in pixels")
     heads = (*(f"{region} {part}" for region, part in _D1), "density", "EPE", "published e4", "published e5, noc")
     for head in heads:
         table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
     for index, row in enumerate(rows):
-        found = figures(row.result)
-        beside = published_beside(row)
-        cells = [found["d1"][region][part] for region, part in _D1]
+        scores = summary(row.result)
+        paper = published_values(row)
+        cells = [scores["d1"][region][part] for region, part in _D1]
         table.add_row(
             *_names(row),
             *(_figure(cell) for cell in cells),
-            _figure(found["density"], 1),
-            _figure(found["epe"]),
-            _figure(beside["validation_d1"]),
-            _figure(beside["test_d1_noc"]),
+            _figure(scores["density"], 1),
+            _figure(scores["epe"]),
+            _figure(paper["validation_d1"]),
+            _figure(paper["test_d1_noc"]),
             end_section=_ends(rows, index),
         )
     return table
 
 
-def _times(rows: Sequence[Row]) -> Table:
+def _times(rows: Sequence[StudyRow]) -> Table:
     table = _table("milliseconds a frame: medians, after a call to warm up")
     for head in (TOTAL, *GROUPS, OTHER, "published, AGX Xavier"):
         table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
     for index, row in enumerate(rows):
         cells = (row.ms.get(name) for name in (TOTAL, *GROUPS, OTHER))
-        beside = published_beside(row)["agx_ms"]
+        paper_ms = published_values(row)["agx_ms"]
         table.add_row(
-            *_names(row), *(_figure(cell, 1) for cell in cells), _figure(beside), end_section=_ends(rows, index)
+            *_names(row), *(_figure(cell, 1) for cell in cells), _figure(paper_ms), end_section=_ends(rows, index)
         )
     return table
 
@@ -119,12 +119,12 @@ def _table(heading: str) -> Table:
     return table
 
 
-def _names(row: Row) -> tuple[str, str]:
-    setting = "" if row.configuration.setting == PEER else title(row.configuration.setting)
-    return row.configuration.label, setting if row.missing is None else f"{setting} (missing)".strip()
+def _names(row: StudyRow) -> tuple[str, str]:
+    variant = "" if row.configuration.variant == BASELINE else title(row.configuration.variant)
+    return row.configuration.label, variant if row.missing is None else f"{variant} (missing)".strip()
 
 
-def _ends(rows: Sequence[Row], index: int) -> bool:
+def _ends(rows: Sequence[StudyRow], index: int) -> bool:
     return index + 1 < len(rows) and rows[index + 1].configuration.label != rows[index].configuration.label
 
 

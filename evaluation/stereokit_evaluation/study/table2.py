@@ -1,7 +1,7 @@
 """Table II of the StereoVAE paper on this machine: the matcher alone, and half-size matching with each refiner.
 
-All take turns, round by round, on one pair, beside OpenCV's modes; the published times are those of the paper's
-Jetson boards. A refiner that is not there is listed with the reason.
+All take turns, round by round, on one pair, together with OpenCV's modes; the published times are those of the paper's
+Jetson boards. A missing refiner is listed with the reason.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any
 from rich.console import Console
 
 from stereokit.kernels.trace import observed
-from stereokit_evaluation.bench.peers import HH, PEERS, THREE_WAY, Call, opencv_threads
+from stereokit_evaluation.bench.baselines import BASELINES, HH, THREE_WAY, Call, opencv_threads
 from stereokit_evaluation.bench.stages import GROUPS, StageTimer
 from stereokit_evaluation.bench.table import format_ms, new_table
 from stereokit_evaluation.bench.timing import Spread, round_robin, spread
 from stereokit_evaluation.common.sizes import Size
 from stereokit_evaluation.data import published
 from stereokit_evaluation.scoring.runner import Matching
-from stereokit_evaluation.study.configurations import Configuration, build, describe_error, settings_at_hand
+from stereokit_evaluation.study.configurations import Configuration, available_variants, build, describe_error
 from stereokit_refiners.learned import BACKENDS, PRECISIONS
 
 __all__ = ["PipelineRow", "as_json", "print_pipeline", "time_pipeline"]
@@ -37,18 +37,18 @@ class PipelineRow:
     Attributes
     ----------
     name : str
-        What was timed.
+        The configuration.
     size : str
         Name of the size.
     threads : int
     seconds : list of float
         Of each run.
     parts : dict of lists of float
-        Of these, what each group of stages took (`stereokit_evaluation.bench.stages.GROUPS`).
+        Seconds of each group of stages in each run (`stereokit_evaluation.bench.stages.GROUPS`).
     missing : str or None
-        Why it was not timed.
+        The reason why it was not timed.
     printed : str or None
-        The row of the paper's table II that stands beside it.
+        The comparable row of the paper's table II.
     """
 
     name: str
@@ -78,7 +78,7 @@ def time_pipeline(
     rounds: int,
     rows: list[PipelineRow],
     *,
-    with_peers: bool = True,
+    with_baselines: bool = True,
     runtimes: str | None = None,
     weights: str | None = None,
     step: Callable[[str], None] = lambda text: None,
@@ -96,7 +96,7 @@ def time_pipeline(
     rounds : int
         Timed calls of each, after one that is not.
     rows : list of PipelineRow
-    with_peers : bool
+    with_baselines : bool
         OpenCV's 3WAY and HH too.
     runtimes : str or None
         A refiner that is timed in each runtime and precision too.
@@ -113,18 +113,18 @@ def time_pipeline(
         for suffix, configuration in _configurations(methods, options, runtimes):
             label, printed = configuration.name + suffix, None
             if configuration.label == "S4" and not suffix:
-                printed = _PRINTED.get(configuration.setting)
+                printed = _PRINTED.get(configuration.variant)
             row = PipelineRow(label, size.name, threads, times.setdefault(label, []), printed=printed)
             rows.append(row)
             call, row.missing = _warmed(configuration, images)
             if call is not None:
                 calls[label] = _watching(configuration.matcher, call, images, row)
             step(f"{size.name}: {label}, first call")
-        for key in (THREE_WAY, HH) if with_peers else ():
+        for key in (THREE_WAY, HH) if with_baselines else ():
             rows.append(PipelineRow(key, size.name, threads, times.setdefault(key, [])))
-            peer: Call = PEERS[key].make(size.levels)
-            peer(*images)
-            calls[key] = lambda peer=peer: peer(*images)  # type: ignore[misc]
+            baseline: Call = BASELINES[key].make(size.levels)
+            baseline(*images)
+            calls[key] = lambda baseline=baseline: baseline(*images)  # type: ignore[misc]
             step(f"{size.name}: {key}, first call")
         round_robin(calls, rounds, times, step=lambda name: step(f"{size.name}, {threads} threads: {name}"))
 
@@ -132,57 +132,59 @@ def time_pipeline(
 def _configurations(
     methods: Sequence[str], options: Mapping[str, Any], runtimes: str | None
 ) -> list[tuple[str, Configuration]]:
-    """Return what is timed, each with what its name says beyond its setting."""
-    found = [("", configuration) for configuration in build(methods, settings_at_hand(), options)]
+    """Return the configurations to time, each with the suffix of its name."""
+    configurations = [("", configuration) for configuration in build(methods, available_variants(), options)]
     for backend in BACKENDS if runtimes is not None else ():
         for precision in PRECISIONS if backend == "openvino" else ("fp32",):
-            chosen = {**options, "backend": backend, "precision": precision}
-            found += [(f", {backend} {precision}", c) for c in build(methods, [str(runtimes)], chosen)]
-    return found
+            runtime_options = {**options, "backend": backend, "precision": precision}
+            configurations += [
+                (f", {backend} {precision}", c) for c in build(methods, [str(runtimes)], runtime_options)
+            ]
+    return configurations
 
 
 def as_json(rows: Sequence[PipelineRow]) -> list[dict[str, Any]]:
     """Return the rows as ``pipeline`` of the JSON."""
-    found = []
+    entries = []
     for row in rows:
-        ours = row.spread
-        found.append(
+        times = row.spread
+        entries.append(
             {
                 "name": row.name,
                 "size": row.size,
                 "threads": row.threads,
                 "runs": len(row.seconds),
-                "median_ms": None if ours is None else ours.median,
-                "q25_ms": None if ours is None else ours.q25,
-                "q75_ms": None if ours is None else ours.q75,
+                "median_ms": None if times is None else times.median,
+                "q25_ms": None if times is None else times.q25,
+                "q75_ms": None if times is None else times.q75,
                 "parts_ms": {group: row.part_ms(group) for group in GROUPS},
                 "missing": row.missing,
                 "published_ms": None if row.printed is None else _jetson(row.printed),
                 "published_row": row.printed,
             }
         )
-    return found
+    return entries
 
 
 def print_pipeline(sizes: Sequence[Size], rows: Sequence[PipelineRow]) -> None:
-    """Print one table for each size, then what is missing, and what the published times are."""
+    """Print one table for each size, then the missing rows and a note on the published times."""
     console = Console(width=None if sys.stdout.isatty() else 120)
     for size in sizes:
-        here = [row for row in rows if row.size == size.name]
-        if not here:
+        size_rows = [row for row in rows if row.size == size.name]
+        if not size_rows:
             continue
         table = new_table(f"table II of the paper, {size.name}: {size.width}x{size.height}, {size.levels} levels")
         for head in ("threads", "ms", "q25-q75", *GROUPS, "published, TX2", "published, AGX"):
             table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
-        for row in here:
-            ours, theirs = row.spread, _jetson(row.printed or "")
+        for row in size_rows:
+            times, jetson_ms = row.spread, _jetson(row.printed or "")
             table.add_row(
                 f"{row.name} (missing)" if row.missing else row.name,
                 str(row.threads),
-                "-" if ours is None else format_ms(ours.median),
-                "-" if ours is None else f"{format_ms(ours.q25)}-{format_ms(ours.q75)}",
+                "-" if times is None else format_ms(times.median),
+                "-" if times is None else f"{format_ms(times.q25)}-{format_ms(times.q75)}",
                 *("-" if (ms := row.part_ms(group)) is None else format_ms(ms) for group in GROUPS),
-                *(f"{theirs[board]:.2f}" if board in theirs else "-" for board in ("TX2", "AGX")),
+                *(f"{jetson_ms[board]:.2f}" if board in jetson_ms else "-" for board in ("TX2", "AGX")),
             )
         console.print(table)
     for line in dict.fromkeys(f"missing: {row.name}: {row.missing}" for row in rows if row.missing):
@@ -199,27 +201,27 @@ def _jetson(row: str) -> Mapping[str, float]:
 
 
 def _warmed(configuration: Configuration, images: tuple[Any, Any]) -> tuple[Matching | None, str | None]:
-    """Call a configuration once; return it, or why it cannot be called."""
+    """Call a configuration once; return its matcher, or the reason why it cannot be called."""
     if configuration.matcher is None:
         return None, configuration.missing
     try:
         configuration.matcher(*images)
     except Exception as error:  # a plug-in's own trouble
-        if configuration.setting in ("original", "linear"):
+        if configuration.variant in ("original", "linear"):
             raise
         return None, describe_error(error)
     return configuration.matcher, None
 
 
 def _watching(matcher: Any, call: Matching, images: tuple[Any, Any], row: PipelineRow) -> Callable[[], object]:
-    """Return the call to time; it notes what the refiner took."""
+    """Return the call to time; it records the seconds of each group of stages."""
 
     def run() -> object:
         timer = StageTimer(groups=True)
         with observed(timer):
-            found = call(*images)
+            result = call(*images)
         for group in GROUPS:
             row.parts.setdefault(group, []).append(timer.seconds.get(group, 0.0))
-        return found
+        return result
 
     return run

@@ -1,1 +1,1 @@
-"""What training needs of the data."""
+"""Training of refiners on data sets and synthetic streets."""

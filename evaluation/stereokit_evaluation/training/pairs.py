@@ -1,7 +1,7 @@
 """Pairs to train on: frames of a data set, and synthetic streets under many cameras.
 
 The streets are those of `stereokit_evaluation.synthetic.scenes`, each with its own size, noise, blur and exposure,
-drawn from its seed. They are slow to render, so they are kept in a folder, under a name that says what made them.
+drawn from its seed. They are slow to render, so they are cached in a folder, by seed and a digest of the sources.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FIRST_SEED = 100_000
 
 
 def pair_of(frame: Frame) -> Pair:
-    """Return a frame as a pair for training; ground truth that it lacks is left open.
+    """Return a frame as a pair for training; missing ground truth is NaN.
 
     Raises
     ------
@@ -51,14 +51,14 @@ def scene_pair(seed: int, cache: Path | None = None) -> Pair:
     Parameters
     ----------
     seed : int
-        Decides the street, its size, and the camera.
+        Seed of the street, its size, and the camera.
     cache : Path, optional
-        Folder that rendered streets are kept in.
+        Folder of rendered streets.
     """
     path = None if cache is None else cache / f"street-{seed}-{_fingerprint()}.npz"
     if path is not None and path.exists():
-        with parsing(path, "street", "cache must hold streets of this program"), np.load(path) as held:
-            content = {name: held[name] for name in ("left", "right", "noc", "occ")}
+        with parsing(path, "street", "cache must hold streets of this program"), np.load(path) as file:
+            content = {name: file[name] for name in ("left", "right", "noc", "occ")}
     else:
         content = _render(seed)
         if path is not None:
@@ -82,7 +82,7 @@ def _render(seed: int) -> dict[str, NDArray[Any]]:
 
 
 def _encoded(truth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Return a map as KITTI keeps it: 1/256 pixels, 0 unknown."""
+    """Return a map in KITTI's encoding: 1/256 pixels, 0 unknown."""
     known = np.clip(np.rint(np.nan_to_num(truth) * 256), 1, 65535)
     return np.where(np.isnan(truth), 0, known).astype(np.uint16)
 

@@ -1,7 +1,7 @@
-"""Where ``stereokit study --train`` gets refiners that were trained for one matcher, as the paper's must have been.
+"""Refiners for one matcher each, trained by ``stereokit study --train``, as the paper's must have been.
 
 A refiner is tied to its matcher: a network that was trained on the half-size maps of one does worse on those of
-another. `retrain` is the one place where training (`stereokit_evaluation.training.run`) plugs into the study.
+another. Only `retrain` connects the training (`stereokit_evaluation.training.run`) to the study.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from stereokit_refiners.weights import NETWORKS
 __all__ = ["TRAINED", "retrain", "training_frames"]
 
 TRAINED = tuple(NETWORKS)
-"""The settings whose refiners are trained; others have nothing to learn, or come as they are."""
+"""The variants whose refiners are trained; others have nothing to learn, or come with their weights."""
 
 _STREETS = 160
 
@@ -53,10 +53,10 @@ def training_frames(dataset: str, root: Path | None, scored: Sequence[Frame]) ->
     if dataset != "kitti2015":
         raise OptionError(f"train must go with dataset kitti2015 or scenes, got {dataset!r}")
     names = {frame.name for frame in scored}
-    left = [frame for frame in split(datasets.load(dataset, root), "train")[1] if frame.name not in names]
-    if not left:
+    remaining = [frame for frame in split(datasets.load_frames(dataset, root), "train")[1] if frame.name not in names]
+    if not remaining:
         raise OptionError("train must leave frames to train on, but all are scored; choose some by --frames or --split")
-    return left
+    return remaining
 
 
 def retrain(
@@ -79,11 +79,11 @@ def retrain(
     refiner : str
         One of `TRAINED`.
     frames : sequence of Frame
-        What to train on; none trains on synthetic streets that the study does not score.
+        Frames to train on; without any, synthetic streets that the study does not score.
     folder : Path
-        Where checkpoint and weights are kept: an interrupted training goes on, a finished one is not done again.
+        Folder of checkpoint and weights: an interrupted training resumes, a finished one is not repeated.
     dataset, root : str, Path or None
-        Where `frames` come from.
+        The source of `frames`.
     max_disparity : int
         Of the matcher, full-size pixels.
     settings : sequence of str
@@ -97,12 +97,12 @@ def retrain(
     packages = (stereokit_refiners.__file__, stereokit_evaluation.__file__)
     source = [fingerprint(Path(str(file)).parent) for file in packages]
     key = digest([method, refiner, [frame_digest(f) for f in frames], max_disparity, list(settings), source])
-    home = make_folder(folder / f"{method}-{refiner}-{key[:12]}")
-    weights, done = home / "weights.safetensors", home / "done.json"
-    if weights.is_file() and done.is_file():
+    training_folder = make_folder(folder / f"{method}-{refiner}-{key[:12]}")
+    weights, marker = training_folder / "weights.safetensors", training_folder / "done.json"
+    if weights.is_file() and marker.is_file():
         return str(weights)
     run_training(
-        home,
+        training_folder,
         refiner,
         dataset=dataset if frames else None,
         root=root if frames else None,
@@ -113,5 +113,5 @@ def retrain(
         max_disparity=max_disparity,
         cache=folder / "cache",
     )
-    write_bytes(done, json.dumps({"method": method, "refiner": refiner, "settings": list(settings)}).encode())
+    write_bytes(marker, json.dumps({"method": method, "refiner": refiner, "settings": list(settings)}).encode())
     return str(weights)

@@ -1,12 +1,14 @@
-"""A training from its data to its weights, as ``stereokit train`` and the study start it.
+"""A training from its data to its weights, for ``stereokit train`` and the study.
 
-The result is a folder with ``weights.safetensors``, ``curves.csv``, ``curves.png``, and the checkpoint from which a
-killed run goes on when it is called again with the same options. With `folds` each group of frames is held out once.
+The result is a folder with ``weights.safetensors``, ``curves.csv``, ``curves.png``, and a checkpoint. A killed run
+resumes from the checkpoint when it is called again with the same options. With `folds` each group of frames is held
+out once.
 """
 
 from __future__ import annotations
 
 import io
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
@@ -15,11 +17,13 @@ from typing import Any
 
 from stereokit.cli.options import parse_settings
 from stereokit.errors import InputError, OptionError, StereokitError
+from stereokit.images.check import check_integer
 from stereokit.io import make_folder, write_bytes
 from stereokit.methods import check_levels, parse_method
 from stereokit_evaluation.common.progress import progress
-from stereokit_evaluation.data.datasets import load, select
+from stereokit_evaluation.data.datasets import load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.training.generated import GENERAL, generated_pairs, levels_for, train_general
 from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of, scene_pair
 
 __all__ = ["run_training"]
@@ -30,26 +34,29 @@ _MATCHERS = ("S1", "S2", "S3", "S4")
 def run_training(
     output: Path, refiner: str = "stereovae", *, dataset: str | None = None, root: Path | None = None,
     frames: str | None = None, validation: str | None = None, folds: str | None = None, extra: Sequence[str] = (),
-    extra_share: float = 0.2, streets: int = 0, street_share: float = 0.5, method: Sequence[str] = _MATCHERS,
-    variants: int = 9, start: Path | None = None, preset: str = "default", settings: Sequence[str] = (),
-    max_disparity: int = 128, cache: Path | None = None,
+    extra_share: float = 0.2, streets: int = 0, generated: int = 0, street_share: float = 0.5,
+    method: Sequence[str] = _MATCHERS, variants: int = 9, start: Path | None = None, preset: str = "default",
+    settings: Sequence[str] = (), max_disparity: int = 128, cache: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Train a refiner; killed, it goes on from its checkpoint when called again with the same options.
+    """Train a refiner; after a kill, the same call resumes from the checkpoint.
 
     Parameters
     ----------
     output : Path
-        Folder of the result; made if missing.
+        Folder of the result; created if missing.
     refiner : str
-        Architecture, one of `stereokit_refiners.weights.NETWORKS`.
+        Architecture, one of `stereokit_refiners.weights.NETWORKS`, or ``"stereokit"``.
     dataset, root : str, Path, optional
         A data set and its folder.
     frames, validation, folds : str, optional
-        Frames to train on, to look at on the way, and groups to hold out in turn (``0-3/13-17``).
+        Frames to train on, to validate on, and groups to hold out in turn (``0-3/13-17``).
     extra : sequence of str
         More frames to train on, ``DATASET:ROOT``, never held out; `extra_share` of the crops.
     streets : int
         Synthetic streets to train on; `street_share` of the crops.
+    generated : int
+        Generated pairs of all kinds to train on, as streets are; the general refiner (``"stereokit"``) trains on these
+        alone.
     method : sequence of str
         Matchers whose maps are trained on.
     variants : int
@@ -66,7 +73,7 @@ def run_training(
     Returns
     -------
     dict
-        What was trained, on what, and the scores of held-out frames; ``"rank"`` is this process' number.
+        The refiner, its settings and frames, and the scores of held-out frames; ``"rank"`` is this process' number.
 
     Raises
     ------
@@ -74,16 +81,25 @@ def run_training(
         If an option breaks its rule, frames have no ground truth, files cannot be used, or torch is not installed.
     """
     torch = _torch()
+    check_integer("generated", generated, 0)
+    if refiner in GENERAL:
+        others: dict[str, Any] = {"dataset": dataset, "streets": streets, "extra": extra, "folds": folds}
+        others |= {"frames": frames, "validation": validation}
+        for name in (name for name, value in others.items() if value):
+            raise OptionError(f"refiner {refiner!r} trains on generated pairs alone, got {name} too")
+        if generated < 1:
+            raise OptionError(f"generated must be at least 1 for refiner {refiner!r}, got {generated}")
+        return train_general(output, generated, start=start, settings=settings, cache=cache)
     from stereokit_refiners.networks.layers import output_rule
     from stereokit_refiners.training.loop import Source
     from stereokit_refiners.training.samples import SampleFiles, store_variant
     from stereokit_refiners.weights import NETWORKS, read
 
-    chosen = _settings(preset, settings)
+    training_settings = _training_settings(preset, settings)
     if refiner not in NETWORKS:
         raise OptionError(f"refiner to train must be one of {', '.join(NETWORKS)}, got {refiner!r}")
-    if dataset is None and streets < 1 and not extra:
-        raise OptionError("dataset, extra or streets must be given, got none of them")
+    if dataset is None and streets < 1 and generated < 1 and not extra:
+        raise OptionError("dataset, extra, streets or generated must be set, got none of them")
     if folds is not None and (dataset is None or validation is not None):
         raise OptionError(f"folds must come with a dataset and without validation, got {folds!r}")
     if not (0 <= extra_share and 0 <= street_share and extra_share + street_share <= 1) or streets < 0 or variants < 1:
@@ -98,22 +114,22 @@ def run_training(
     for name in methods:
         parse_method(name)
     check_levels(0, max_disparity)
-    output_rule(NETWORKS[refiner], chosen.output_mode)
-    everything = [] if dataset is None else list(load(dataset, root))
-    groups = _groups(everything, frames, validation, folds)
-    more = _extra(extra)
-    tested_names = {f"{dataset}/{frame.name}" for _, part in groups for frame in part}
-    if common := sorted(tested_names & more.keys()):
-        raise OptionError(f"extra must not bring frames that are held out, got {common[0]!r}")
+    output_rule(NETWORKS[refiner], training_settings.output_mode)
+    all_frames = [] if dataset is None else list(load_frames(dataset, root))
+    groups = _groups(all_frames, frames, validation, folds)
+    extra_frames = _extra(extra)
+    test_names = {f"{dataset}/{frame.name}" for _, part in groups for frame in part}
+    if shared := sorted(test_names & extra_frames.keys()):
+        raise OptionError(f"extra must not bring frames that are held out, got {shared[0]!r}")
     if dataset is not None and not all(training for training, _ in groups):
-        raise OptionError("frames must leave some to train on beside those held out, got none")
-    for frame in (*more.values(), *(f for pair in groups for part in pair for f in part)):
+        raise OptionError("frames must leave some to train on that are not held out, got none")
+    for frame in (*extra_frames.values(), *(f for pair in groups for part in pair for f in part)):
         if frame.noc is None and frame.occ is None:
             raise InputError(f"frame {frame.name} has no ground truth to train on")
     if cache is not None:
         make_folder("cache", cache)
     make_folder("output", output)
-    folder_of_maps = output / "cache" if cache is None else cache
+    cache_folder = output / "cache" if cache is None else cache
     world = _join_group(torch)
 
     def stored(frame: Frame, numbers: range, step: Callable[..., None]) -> list[Path]:
@@ -121,44 +137,66 @@ def run_training(
         paths = []
         for name in methods:
             for number in numbers:
-                paths.append(store_variant(pair, name, chosen.seed, number, max_disparity, folder_of_maps))
+                paths.append(store_variant(pair, name, training_settings.seed, number, max_disparity, cache_folder))
                 step(f"{frame.name} {name}")
         return paths
 
     def stored_streets(step: Callable[..., None]) -> list[Path]:
         paths = []
         for k in range(streets):
-            pair = scene_pair(FIRST_SEED + k, folder_of_maps)
+            pair = scene_pair(FIRST_SEED + k, cache_folder)
             for n in (0, 1):
                 name = methods[(k + 2 * n) % len(methods)]
-                paths.append(store_variant(pair, name, chosen.seed, n + 1, max_disparity, folder_of_maps))
+                paths.append(store_variant(pair, name, training_settings.seed, n + 1, max_disparity, cache_folder))
                 step(pair.name)
         return paths
 
-    trained = {frame.name: frame for training, _ in groups for frame in training} | more
-    tested = {frame.name: frame for _, held_out in groups for frame in held_out}
-    total = (len(trained) * variants + len(tested)) * len(methods) + 2 * streets
+    def stored_pairs(step: Callable[..., None]) -> list[Path]:
+        paths = []
+        for pair in generated_pairs(generated, cache_folder / "pairs"):
+            levels = max(max_disparity, levels_for(pair))
+            for n, name in itertools.product((0, 1), methods):
+                paths.append(store_variant(pair, name, training_settings.seed, n, levels, cache_folder))
+                step(f"{pair.name} {name}")
+        return paths
+
+    training_frames = {frame.name: frame for training, _ in groups for frame in training} | extra_frames
+    test_frames = {frame.name: frame for _, held_out in groups for frame in held_out}
+    total = (len(training_frames) * variants + len(test_frames)) * len(methods) + 2 * streets
+    total += 2 * generated * len(methods)
     with progress(total) as (_, step):
-        maps = {name: stored(frame, range(variants), step) for name, frame in trained.items()}
-        truth = {name: stored(frame, range(1), step) for name, frame in tested.items()}
-        scenes = stored_streets(step)
+        maps = {name: stored(frame, range(variants), step) for name, frame in training_frames.items()}
+        held_out_maps = {name: stored(frame, range(1), step) for name, frame in test_frames.items()}
+        scenes = [*stored_streets(step), *stored_pairs(step)]
     results = []
     for number, (training, held_out) in enumerate(groups):
-        mine = [path for frame in training for path in maps[frame.name]]
-        others = [path for name in more for path in maps[name]]
-        of_streets = (street_share if mine or others else 1.0) if scenes else 0.0
-        of_others = (extra_share if mine else 1 - of_streets) if others else 0.0
-        shares = ((scenes, of_streets), (mine, 1 - of_streets - of_others), (others, of_others))
+        own_maps = [path for frame in training for path in maps[frame.name]]
+        extra_maps = [path for name in extra_frames for path in maps[name]]
+        street_part = (street_share if own_maps or extra_maps else 1.0) if scenes else 0.0
+        extra_part = (extra_share if own_maps else 1 - street_part) if extra_maps else 0.0
+        shares = ((scenes, street_part), (own_maps, 1 - street_part - extra_part), (extra_maps, extra_part))
         sources = [Source(SampleFiles(paths), share) for paths, share in shares if paths and share > 0]
         folder = output if folds is None else output / f"fold-{number}"
-        where = [(frame.name, name) for frame in held_out for name in methods]
-        looked_at = SampleFiles([path for frame in held_out for path in truth[frame.name]])
-        seen = [*(f"{dataset}/{frame.name}" for frame in training), *more]
-        outcome = _train_one(refiner, sources, looked_at, where, chosen, content, folder, world, seen, max_disparity)
+        labels = [(frame.name, name) for frame in held_out for name in methods]
+        held_out_samples = SampleFiles([path for frame in held_out for path in held_out_maps[frame.name]])
+        trained_on = [*(f"{dataset}/{frame.name}" for frame in training), *extra_frames]
+        outcome = _train_one(
+            refiner,
+            sources,
+            held_out_samples,
+            labels,
+            training_settings,
+            content,
+            folder,
+            world,
+            trained_on,
+            max_disparity,
+        )
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})
     return {
-        "refiner": refiner, "settings": asdict(chosen), "methods": methods, "streets": streets,
-        "frames": sorted(trained), "results": results, "pooled": _pooled(results, methods), "rank": world[0],
+        "refiner": refiner, "settings": asdict(training_settings), "methods": methods, "streets": streets,
+        "generated": generated,
+        "frames": sorted(training_frames), "results": results, "pooled": _pooled(results, methods), "rank": world[0],
     }  # fmt: skip
 
 
@@ -170,7 +208,7 @@ def _torch() -> Any:
     return torch
 
 
-def _settings(preset: str, texts: Sequence[str]) -> Any:
+def _training_settings(preset: str, texts: Sequence[str]) -> Any:
     from stereokit_refiners.training.loop import PRESETS, Settings
 
     if preset not in PRESETS:
@@ -187,38 +225,38 @@ def _settings(preset: str, texts: Sequence[str]) -> Any:
 
 
 def _groups(
-    everything: Sequence[Frame], frames: str | None, validation: str | None, folds: str | None
+    all_frames: Sequence[Frame], frames: str | None, validation: str | None, folds: str | None
 ) -> list[tuple[list[Frame], list[Frame]]]:
     """Return (training, held out) pairs of frames; no frame is in both."""
     if folds is None:
-        held_out = select(everything, validation) if validation is not None else []
-        training = [f for f in select(everything, frames) if f not in held_out]
+        held_out = select_frames(all_frames, validation) if validation is not None else []
+        training = [f for f in select_frames(all_frames, frames) if f not in held_out]
         return [(training, held_out)]
-    parts = [select(everything, part) for part in folds.split("/")]
+    parts = [select_frames(all_frames, part) for part in folds.split("/")]
     names = [frame.name for part in parts for frame in part]
     if len(parts) < 2 or len(set(names)) < len(names):
         raise OptionError(f"folds must be two groups or more that share no frame, got {folds!r}")
-    extra = [] if frames is None else [f for f in select(everything, frames) if f.name not in names]
+    extra = [] if frames is None else [f for f in select_frames(all_frames, frames) if f.name not in names]
     return [([*(f for other in parts if other is not part for f in other), *extra], part) for part in parts]
 
 
 def _extra(texts: Sequence[str]) -> dict[str, Frame]:
-    """Return the frames of further data sets by names that clash with no other."""
+    """Return the frames of further data sets by unique names, ``DATASET/NAME``."""
     frames = {}
-    for text in texts:
-        dataset, colon, root = text.partition(":")
+    for source in texts:
+        dataset, colon, root = source.partition(":")
         if not colon or not root:
-            raise OptionError(f"extra must be DATASET:ROOT, got {text!r}")
-        for frame in load(dataset, root):
+            raise OptionError(f"extra must be DATASET:ROOT, got {source!r}")
+        for frame in load_frames(dataset, root):
             name = f"{dataset}/{frame.name}"
             if name in frames:
-                raise OptionError(f"extra must not bring two frames called {name!r}, got {text!r}")
+                raise OptionError(f"extra must not bring two frames called {name!r}, got {source!r}")
             frames[name] = frame
     return frames
 
 
 def _join_group(torch: Any) -> tuple[int, int]:
-    """Join the processes that torchrun started; return this one's number, and how many there are."""
+    """Join the processes of torchrun; return this one's number, and their count."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
         return 0, 1
@@ -227,8 +265,8 @@ def _join_group(torch: Any) -> tuple[int, int]:
 
 
 def _train_one(
-    refiner: str, sources: Any, looked_at: Sequence[Any], where: Sequence[tuple[str, str]], settings: Any, start: Any,
-    folder: Path, world: tuple[int, int], seen: Sequence[str], max_disparity: int,
+    refiner: str, sources: Any, held_out_samples: Sequence[Any], labels: Sequence[tuple[str, str]], settings: Any,
+    start: Any, folder: Path, world: tuple[int, int], trained_on: Sequence[str], max_disparity: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Train, calibrate, write the folder; return the counts of bad and known pixels by matcher."""
     from stereokit_refiners.training.loop import bad_pixels, calibrated, fit, predict, restored
@@ -237,21 +275,21 @@ def _train_one(
     network = NETWORKS[refiner]
     make_folder("output", folder)
     with progress(settings.steps) as (_, step):
-        at = 0
+        steps = 0
 
-        def tell(done: int, loss: float, score: float | None) -> None:
-            nonlocal at
-            shown = "" if score is None else f" D1 {score:.2f} %"
-            step(f"{folder.name} loss {loss:.2f}{shown}", done - at)
-            at = done
+        def report(steps_done: int, loss: float, score: float | None) -> None:
+            nonlocal steps
+            score_text = "" if score is None else f" D1 {score:.2f} %"
+            step(f"{folder.name} loss {loss:.2f}{score_text}", steps_done - steps)
+            steps = steps_done
 
         arrays, history = fit(
-            network, sources, looked_at, settings, start=None if start is None else start.arrays,
-            checkpoint=folder / "checkpoint.pt", progress=tell, rank=world[0], world=world[1],
+            network, sources, held_out_samples, settings, start=None if start is None else start.arrays,
+            checkpoint=folder / "checkpoint.pt", progress=report, rank=world[0], world=world[1],
         )  # fmt: skip
     module = restored(network, arrays)
     counts: dict[str, list[int]] = {}
-    for sample, (_, name) in zip(looked_at, where, strict=True):
+    for sample, (_, name) in zip(held_out_samples, labels, strict=True):
         bad, known = bad_pixels(predict(module, settings.output_mode, sample), sample)
         total = counts.setdefault(name, [0, 0])
         total[0] += bad
@@ -260,7 +298,7 @@ def _train_one(
         ranges = calibrated(module, settings.output_mode, sources)
         notes = {
             "disparities": [0, max_disparity],
-            "frames": sorted(seen),
+            "frames": sorted(trained_on),
             "settings": asdict(settings),
             "start": None if start is None else start.fingerprint,
         }

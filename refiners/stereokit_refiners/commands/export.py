@@ -57,10 +57,12 @@ def export(
         raise FileError(f"output must name a file in an existing folder, got {str(output)!r}")
     content = _content(refiner, weights)
     _check_exportable(content)
-    needed = ["onnx", "onnxruntime"] + (["openvino"] if format == "openvino" else [])
+    needed = ["onnxruntime"] + (["openvino"] if format == "openvino" else [])
     for module in needed:
         if importlib.util.find_spec(module) is None:
-            raise StereokitError(f"export needs {module}, which is not installed: pip install 'stereokit[onnx,fast]'")
+            raise StereokitError(
+                f"export needs {module}, which is not installed: pip install 'stereokit[onnx,refiners]'"
+            )
     model = onnx_model(content)
     difference = largest_difference(content, model)
     if not difference <= TOLERANCE_PX:
@@ -105,8 +107,7 @@ def onnx_model(content: WeightFile) -> bytes:
     """Return the refiner of a weight file as a serialised ONNX model."""
     from stereokit_refiners.runtimes.onnx import map_graph
 
-    model: bytes = map_graph(NETWORKS[content.network], content.arrays, content.output_mode).SerializeToString()
-    return model
+    return map_graph(NETWORKS[content.network], content.arrays, content.output_mode)
 
 
 def largest_difference(content: WeightFile, model: bytes) -> float:

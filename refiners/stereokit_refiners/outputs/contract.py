@@ -65,4 +65,4 @@ class Output(Protocol):
         """Return the map of a head in torch, differentiable: (B, channels, h, w) and (B, 1, h, w) to (B, 1, 2h, 2w)."""
 
     def graph_map(self, graph: Any, head: str, coarse: str, candidates: str) -> str:
-        """Add the map of a head to a graph (`stereokit_refiners.runtimes.onnx.GraphOps`) and return its name."""
+        """Add the map of a head to a graph, the operations of `stereokit_refiners.runtimes.onnx`; return its name."""

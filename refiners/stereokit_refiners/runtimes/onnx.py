@@ -1,4 +1,4 @@
-"""Networks as ONNX graphs: what ONNX Runtime runs, and what `stereokit export` writes.
+"""Networks as ONNX graphs: what ONNX Runtime and OpenCV run, and what `stereokit export` writes.
 
 Built from the network's own description, with transposed convolutions in their sub-pixel form. Rows and columns are
 left open, so that one file serves every size (multiples of ``2 * network.stride`` in full-size pixels).
@@ -10,34 +10,31 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
 
 from stereokit_refiners.networks.layers import Network, Weights, output_rule, sub_pixel_kernel
+from stereokit_refiners.runtimes.onnx_file import Node, model_bytes
 
 __all__ = ["head_graph", "map_graph", "session"]
 
-_OPSET = 18
 
-
-class GraphOps:
+class _GraphOps:
     """Ops that append nodes; a tensor is its name."""
 
     def __init__(self, network: Network, weights: Weights) -> None:
         self.table = {layer.name: layer for layer in network.layers}
         self.weights = weights
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
+        self.nodes: list[Node] = []
+        self.constants: dict[str, NDArray[Any]] = {}
 
     def node(self, kind: str, inputs: Sequence[str], count: int = 1, **attributes: Any) -> Any:
         names = [f"t{len(self.nodes)}_{k}" for k in range(count)]
-        self.nodes.append(helper.make_node(kind, list(inputs), names, **attributes))
+        self.nodes.append(Node(kind, list(inputs), names, attributes))
         return names[0] if count == 1 else names
 
     def constant(self, values: Any, dtype: Any = np.float32) -> str:
         name = f"c{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(np.asarray(values, dtype)), name))
+        self.constants[name] = np.asarray(values, dtype)
         return name
 
     def conv(self, name: str, inputs: Sequence[str], *, activate: bool = True) -> str:
@@ -58,7 +55,9 @@ class GraphOps:
         x = inputs[0] if len(inputs) == 1 else self.node("Concat", inputs, axis=1)
         side = weight.shape[-1] // 2
         operands = [x, self.constant(weight), self.constant(bias)]
-        return str(self.node("Conv", operands, pads=[side] * 4, strides=[layer.stride] * 2))
+        return str(
+            self.node("Conv", operands, kernel_shape=[2 * side + 1] * 2, pads=[side] * 4, strides=[layer.stride] * 2)
+        )
 
     def shuffle(self, x: str) -> str:
         return str(self.node("DepthToSpace", [x], blocksize=2, mode="CRD"))
@@ -96,27 +95,29 @@ class GraphOps:
         return str(self.node("Slice", [x, *where]))
 
 
-def _model(ops: GraphOps, name: str, inputs: dict[str, list[Any]], output: str, shape: list[Any]) -> onnx.ModelProto:
-    parameters = [helper.make_tensor_value_info(n, TensorProto.FLOAT, dims) for n, dims in inputs.items()]
-    ops.nodes.append(helper.make_node("Identity", [output], [name]))
-    result = helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-    graph = helper.make_graph(ops.nodes, "stereokit", parameters, [result], ops.constants)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], producer_name="stereokit")
-    model.ir_version = 9
-    onnx.checker.check_model(model)
-    return model
+def _model(ops: _GraphOps, name: str, inputs: dict[str, list[Any]], output: str, shape: list[Any]) -> bytes:
+    return model_bytes([*ops.nodes, Node("Identity", [output], [name], {})], ops.constants, inputs, {name: shape})
 
 
-def head_graph(network: Network, weights: Weights) -> onnx.ModelProto:
-    """Return the graph from encoded inputs, (1, C, h, w), to the ``head``, (1, h, w, C)."""
-    ops = GraphOps(network, weights)
-    inputs = {name: [1, channels, "h", "w"] for name, channels in network.inputs.items()}
+def head_graph(network: Network, weights: Weights, rows: int | None = None, columns: int | None = None) -> bytes:
+    """Return the graph from encoded inputs, (1, C, h, w), to the ``head``, (1, h, w, C), as the content of a file.
+
+    Parameters
+    ----------
+    network : Network
+    weights : mapping
+    rows, columns : int or None
+        Of the inputs; None leaves them open.
+    """
+    ops = _GraphOps(network, weights)
+    size = ["h" if rows is None else rows, "w" if columns is None else columns]
+    inputs = {name: [1, channels, *size] for name, channels in network.inputs.items()}
     head = network.forward(ops, {name: name for name in inputs})["map"]
-    return _model(ops, "head", inputs, ops.node("Transpose", [head], perm=[0, 2, 3, 1]), [1, "h", "w", None])
+    return _model(ops, "head", inputs, ops.node("Transpose", [head], perm=[0, 2, 3, 1]), [1, *size, None])
 
 
-def map_graph(network: Network, weights: Weights, output_mode: str) -> onnx.ModelProto:
-    """Return the whole refiner as a graph, with what `encode` and the output rule do.
+def map_graph(network: Network, weights: Weights, output_mode: str) -> bytes:
+    """Return the whole refiner as a graph, the content of a file, with what `encode` and the output rule do.
 
     Inputs ``coarse``, (1, 1, h, w), half-size pixels, filled; ``left``, (1, 1, 2h, 2w), grey levels 0 to 255; for
     networks that use them ``confidence``, (1, 1, h, w), 0 to 1, and ``candidates``, (1, 2, h, w), half-size pixels.
@@ -128,7 +129,7 @@ def map_graph(network: Network, weights: Weights, output_mode: str) -> onnx.Mode
         If the network sees more than that.
     """
     rule = output_rule(network, output_mode)
-    ops = GraphOps(network, weights)
+    ops = _GraphOps(network, weights)
     unit = rule.unit_inputs
     inputs: dict[str, list[Any]] = {"coarse": [1, 1, "h", "w"], "left": [1, 1, "2h", "2w"]}
     coarse = ops.multiply("coarse", 2)
@@ -161,7 +162,7 @@ def session(
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    graph = head_graph(network, weights).SerializeToString()
+    graph = head_graph(network, weights)
     model = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
     def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:

@@ -157,13 +157,13 @@ def _const(values: Any) -> Any:
 
 
 def _bound(weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.maximum(np.abs(weight).max(axis=(1, 2, 3), keepdims=True), np.float32(1e-8))
+    return np.asarray(np.maximum(np.abs(weight).max(axis=(1, 2, 3), keepdims=True), 1e-8), np.float32)
 
 
 def _rounded_to_steps(weight: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return weights as `_kernel` will hold them."""
     step = _bound(weight) / np.float32(WEIGHT_STEPS)
-    return np.rint(weight / step) * step
+    return np.asarray(np.rint(weight / step) * step, np.float32)
 
 
 def _kernel(weight: NDArray[np.float32], integer: bool) -> Any:

@@ -101,8 +101,8 @@ def _shuffled(x: Array) -> Array:
 
 def forward(network: Network, weights: Weights, inputs: dict[str, NDArray[Any]]) -> Array:
     """Return the (h, w, C) head for (C, h, w) inputs."""
-    given = {name: np.asarray(each, np.float32) for name, each in inputs.items()}
-    head = network.forward(_PlainOps(network, weights), given)["map"]
+    floats = {name: np.asarray(each, np.float32) for name, each in inputs.items()}
+    head = network.forward(_PlainOps(network, weights), floats)["map"]
     return np.ascontiguousarray(head.transpose(1, 2, 0))
 
 
@@ -143,9 +143,9 @@ def _prepared(content: WeightFile) -> tuple[dict[str, NDArray[Any]], Callable[[A
         return inputs, lambda head: rule.map(head, scene["disparity"], rows, columns, candidates=scene["candidates"])
     left = scene["left"]
     right = np.roll(left, -24, axis=1)
-    found = hypotheses(scene["disparity"], scene["candidates"], left, right, 2)
-    inputs = {"evidence": network_input(found, scene["confidence"], left, columns)}
-    return inputs, lambda head: mixture(head, found, rows, columns)[0]
+    values = hypotheses(scene["disparity"], scene["candidates"], left, right, 2)
+    inputs = {"evidence": network_input(values, scene["confidence"], left, columns)}
+    return inputs, lambda head: mixture(head, values, rows, columns)[0]
 
 
 def mistake(content: WeightFile, run: Callable[[dict[str, NDArray[Any]]], Array]) -> float:

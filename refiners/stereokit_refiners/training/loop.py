@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel
 
 from stereokit.errors import OptionError
 from stereokit.io import make_folder, parsing, write_bytes
@@ -115,11 +118,27 @@ def _batches(
             yield step, waiting.result()
 
 
-def _rate(settings: Settings, step: int) -> float:
+def _rate_factor(settings: Settings, step: int) -> float:
+    """Return by what the learning rate of the settings is multiplied at a step."""
     if settings.schedule == "paper":
-        return settings.learning_rate * float(0.97 ** (step // (10 * settings.epoch)))
+        return float(0.97 ** (step // (10 * settings.epoch)))
     warm = min(1.0, (step + 1) / 100)
-    return settings.learning_rate * warm * (0.5 * (1 + float(np.cos(np.pi * step / settings.steps))) + 0.005)
+    return warm * (0.5 * (1 + float(np.cos(np.pi * step / settings.steps))) + 0.005)
+
+
+def _averaged(module: Module, decay: float) -> AveragedModel:
+    """Return the exponential moving average of a module's weights, which begins with what they are now.
+
+    It follows faster at first: after ``n`` steps the weight of the past is at most ``(n + 1) / (n + 10)``.
+    """
+
+    def update(average: Any, current: Any, count: Any) -> None:
+        keep = min(decay, float(count) / (float(count) + 9)) if decay > 0 else 0.0
+        torch._foreach_lerp_(list(average), list(current), 1 - keep)
+
+    average = AveragedModel(module, multi_avg_fn=update)
+    average.n_averaged.fill_(1)  # the beginning counts as the first
+    return average
 
 
 def _loss(
@@ -223,14 +242,14 @@ def fit(
     module = Module(network, torch.Generator().manual_seed(settings.seed))
     if start is not None:
         module.load(start)
-    average = Module(network)
-    average.load(module.arrays())
     layout: Any = {"memory_format": torch.channels_last}
     module.to(device, **layout)
-    average.to(device, **layout)
+    averaged = _averaged(module, settings.ema)
+    average: Any = averaged.module
     optimizer = torch.optim.AdamW(
         module.parameters(), settings.learning_rate, betas=settings.betas, weight_decay=settings.decay
     )
+    schedule = LambdaLR(optimizer, partial(_rate_factor, settings))
     history = History()
     first, best, best_arrays, misses = 0, float("inf"), None, 0
     losses: list[float] = []  # since the last look
@@ -243,8 +262,9 @@ def fit(
             )
         with parsing(checkpoint, "checkpoint", "checkpoint must be one of this program's"):
             module.load_state_dict(state["module"])
-            average.load_state_dict(state["average"])
+            averaged.load_state_dict(state["average"])
             optimizer.load_state_dict(state["optimizer"])
+            schedule.load_state_dict(state["schedule"])
             history.rows = [tuple(row) for row in state["history"]]
             first, best, misses, losses = state["step"], state["best"], state["misses"], state["losses"]
             best_arrays = {k: v.numpy() for k, v in state["best_arrays"].items()} or None
@@ -257,7 +277,8 @@ def fit(
             {
                 "identity": identity,
                 "losses": losses, "step": step, "module": module.state_dict(),
-                "average": average.state_dict(), "optimizer": optimizer.state_dict(), "best": best, "misses": misses,
+                "average": averaged.state_dict(), "optimizer": optimizer.state_dict(),
+                "schedule": schedule.state_dict(), "best": best, "misses": misses,
                 "history": [list(row) for row in history.rows],
                 "best_arrays": {k: torch.from_numpy(v) for k, v in (best_arrays or {}).items()},
             },
@@ -271,8 +292,6 @@ def fit(
     for step, drawn in _batches(network, sources, settings, first, rank):
         torch.manual_seed((settings.seed * 1_000_003 + step) * world + rank)
         batch = {name: tensor.to(device, non_blocking=True) for name, tensor in drawn.items()}
-        for group in optimizer.param_groups:
-            group["lr"] = _rate(settings, step)
         inputs = {name: batch[name].contiguous(**layout) for name in network.inputs}
         with _precision(device, settings.half):
             heads = module(inputs)
@@ -287,10 +306,8 @@ def fit(
         if settings.clip > 0:
             torch.nn.utils.clip_grad_norm_(module.parameters(), settings.clip)
         optimizer.step()
-        keep = min(settings.ema, (step + 1) / (step + 10)) if settings.ema > 0 else 0.0
-        with torch.no_grad():
-            for mine, new in zip(average.parameters(), module.parameters(), strict=True):
-                mine.lerp_(new, 1 - keep)
+        schedule.step()
+        averaged.update_parameters(module)
         losses.append(float(loss.detach()))
         done = step + 1
         if done % settings.evaluate_every == 0 or done == settings.steps:

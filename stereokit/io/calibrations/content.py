@@ -107,7 +107,9 @@ class Content:
         """Of the pose or else the projections, in the file's unit."""
         if self.pose is not None:
             return float(np.linalg.norm(self.pose[1]))
-        return None if self.projections is None else abs(_baseline(*self.projections))
+        if self.projections is None or not all(camera[0, 0] > 0 for camera in self.projections):
+            return None
+        return abs(_baseline(*self.projections))
 
     def scaled(self, factor: float) -> Content:
         """Return it with all lengths times `factor`."""

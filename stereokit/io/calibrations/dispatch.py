@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from stereokit.errors import FileError, OptionError
 from stereokit.io.calibrations.chains import from_euroc, from_kalibr, is_euroc, is_kalibr
@@ -23,10 +28,11 @@ from stereokit.io.calibrations.trees import from_json, from_xml, from_yaml
 from stereokit.io.calibrations.zed import from_zed
 from stereokit.io.reading import parsing, read_text
 
-__all__ = ["KNOWN", "name_of", "read_content"]
+__all__ = ["KNOWN", "digest", "name_of", "read_content"]
 
 KNOWN = (
-    "known are OpenCV's YAML, XML and JSON (K1 D1 K2 D2 R T, P1 P2 or Q), ROS camera_info (left.yaml and right.yaml), "
+    "known are OpenCV's YAML, XML, JSON and npz (K1 D1 K2 D2 R T, P1 P2 or Q), "
+    "ROS camera_info (left.yaml and right.yaml), "
     "Kalibr's camchain, EuRoC's sensor.yaml, ZED's .conf, KITTI, Middlebury's calib.txt, K.txt with a baseline, "
     "and JSON with fx, fy, cx0, cy, baseline_m"
 )
@@ -73,6 +79,18 @@ def read_content(
         return _parsed(files, texts, cameras, size)
 
 
+def digest(paths: Sequence[str | os.PathLike[str]]) -> str:
+    """Return what identifies the content of a calibration of one file or two, or of a folder.
+
+    Raises
+    ------
+    FileError
+        If a file is missing or too large.
+    """
+    files = [part for path in paths for part in _in_folder(Path(path))]
+    return hashlib.sha256("\0".join(_text(path) for path in files).encode()).hexdigest()[:16]
+
+
 def name_of(paths: Sequence[str | os.PathLike[str]]) -> str:
     """Return what messages call a calibration of one file or two."""
     return " and ".join(str(path) for path in paths)
@@ -94,7 +112,19 @@ def _text(path: Path) -> str:
         size = os.stat(path).st_size
     if size > _MOST_BYTES:
         raise FileError(f"{str(path)!r} is no calibration: it has {size} bytes, and one has some thousand")
-    return read_text(path, "calibration")
+    with parsing(path, "calibration"), path.open("rb") as file:
+        archive = file.read(4) == b"PK\3\4"
+    return _archive_text(path) if archive else read_text(path, "calibration")
+
+
+def _archive_text(path: Path) -> str:
+    """Return the arrays of an npz file as JSON; pickles are not opened, nor what unpacks to more than it should."""
+    with parsing(path, "calibration"):
+        with zipfile.ZipFile(path) as archive:
+            if sum(part.file_size for part in archive.infolist()) > _MOST_BYTES:
+                raise OptionError("it is no calibration: its arrays are too large for one")
+        with np.load(path, allow_pickle=False) as arrays:
+            return json.dumps({name: arrays[name].tolist() for name in arrays.files}, default=str)
 
 
 def _parsed(paths: Sequence[Path], texts: Sequence[str], cameras: tuple[int, int] | None, size: Size | None) -> Content:
@@ -130,7 +160,8 @@ def _of_text(text: str, cameras: tuple[int, int] | None, size: Size | None) -> C
         tree = from_json(text)
         if "intrinsic" in tree and "extrinsic" in tree and "baseline" in str(tree["extrinsic"]):
             return from_cityscapes(tree)
-        return None if known_keys(tree) and "fx" not in tree else from_fields(tree)
+        other = '"opencv-matrix"' in text or ("fx" not in tree and known_keys(tree))
+        return None if other else from_fields(tree)
     if re.match(_NUMBERS, start):
         return from_numbers(text)
     if re.search(r"^[ \t]*\[(LEFT|RIGHT)_CAM_\w+\]", text, re.MULTILINE | re.IGNORECASE):

@@ -15,7 +15,17 @@ import cv2
 import numpy as np
 
 from stereokit.errors import OptionError
-from stereokit.io.calibrations.content import UNITS, Array, Content, Size, lens, matrix, numbers, projection
+from stereokit.io.calibrations.content import (
+    UNITS,
+    Array,
+    Content,
+    Size,
+    check_pinhole,
+    lens,
+    matrix,
+    numbers,
+    projection,
+)
 from stereokit.io.calibrations.trees import leaves
 
 __all__ = ["from_keys", "joined_files", "known_keys"]
@@ -43,6 +53,7 @@ _HEIGHTS = ("imageheight", "height", "imgheight", "imageh", "h", "rows")
 _SIZES = ("imagesize", "imgsize", "size", "resolution", "imageresolution", "framesize", "calibrationsize", "rawsize")
 _SHAPES = ("imageshape", "imgshape", "shape")  # height and width, as arrays have them
 _MODELS = ("cameramodel", "distortionmodel", "model", "lensmodel", "cameratype")
+_XI = frozenset(("xi", "xi1", "xi2", "xil", "xir", "xileft", "xiright", "leftxi", "rightxi"))
 _FLAGS = ("fisheye", "isfisheye", "usefisheye")
 
 
@@ -145,6 +156,11 @@ def from_keys(kind: str, values: dict[str, Any]) -> Content:
         If something in it is wrong.
     """
     fields = _Fields(values)
+    if _XI & values.keys():
+        raise OptionError(
+            "the camera model must be pinhole or equidistant fisheye, got an omnidirectional one (it has xi, as of "
+            "cv2.omnidir); calibrate as a fisheye, or undistort the images with cv2.omnidir first"
+        )
     unit = values.get("unit", values.get("units"))
     if unit is not None and unit not in UNITS:
         raise OptionError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
@@ -174,7 +190,7 @@ def from_keys(kind: str, values: dict[str, Any]) -> Content:
     if rotation is not None and translation is not None:
         pose = _rotation(rotation), translation
     elif both_p is not None and both_r is not None and lenses is not None:
-        pose = _pose(both_r, both_p)
+        pose = _pose(both_r, both_p, names)
     if names == ("Q", "Q"):
         both_r = None
     return Content(kind, lenses, pose, both_p, both_r, None, unit, names)
@@ -197,12 +213,14 @@ def _rotation(values: Array) -> Array:
     return values.reshape(3, 3)
 
 
-def _pose(turns: tuple[Array, Array], projections: tuple[Array, Array]) -> tuple[Array, Array]:
+def _pose(turns: tuple[Array, Array], projections: tuple[Array, Array], names: tuple[str, str]) -> tuple[Array, Array]:
     """Return rotation and translation between raw cameras from those into the rectified ones, which lie side by side.
 
     ``R2 x2 = R1 x1 + t``, where ``t = (P2[0, 3] - P1[0, 3]) / fx`` along x.
     """
     left, right = projections
+    for name, camera in zip(names, projections, strict=True):
+        check_pinhole(name, camera)
     along = np.array([right[0, 3] / right[0, 0] - left[0, 3] / left[0, 0], 0, 0])
     return turns[1].T @ turns[0], turns[1].T @ along
 

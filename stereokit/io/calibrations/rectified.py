@@ -50,6 +50,9 @@ def from_fields(content: dict[str, Any]) -> Content:
     if missing:
         raise OptionError(f"it has no field {missing[0]!r}, which a calibration in JSON has")
     one = {name: float(value) for name, value in content.items()}
+    for name, value in one.items():
+        if not np.isfinite(value):
+            raise OptionError(f"{name} must be finite, got {content[name]}")
     for name in ("fx", "fy", "baseline_m"):
         if not one[name] > 0:
             raise OptionError(f"{name} must be positive, got {content[name]}")

@@ -1,7 +1,7 @@
-"""Those who are timed by ``stereokit bench``: our methods, and the libraries that people use instead.
+"""The contenders of ``stereokit bench``: our methods, and other libraries as baselines.
 
-A peer is a name, the module that it needs and a factory; it takes part only when that module can be imported. All
-take two grey ``uint8`` images and are called as their users call them. Only peers that were run are listed.
+A baseline is a name, the module that it needs and a factory; it takes part only when that module can be imported. All
+take two grey ``uint8`` images and are called as their users call them. Only baselines that were run are listed.
 
 OpenCV's matchers get the whole image without padding (which costs them the leftmost columns, not time), their usual
 penalties for block size 5, a uniqueness ratio, the left-right check and no speckle filter. Pandora (CNES) runs its
@@ -29,16 +29,16 @@ from stereokit.matching import Matcher
 from stereokit.result import Disparity
 
 __all__ = [
+    "BASELINES",
     "HH",
-    "PEERS",
     "THREE_WAY",
+    "Baseline",
     "Call",
-    "Peer",
+    "baselines",
     "label",
     "make",
     "opencv_threads",
     "padded",
-    "peers",
     "usable_levels",
 ]
 
@@ -51,28 +51,28 @@ _BLOCK = 5
 
 
 @dataclass(frozen=True)
-class Peer:
+class Baseline:
     """A matcher of another library.
 
     Attributes
     ----------
     name : str
-        As the table calls it.
+        The name in the table.
     module : str
-        What must be importable.
+        The module that it needs.
     make : callable
         Takes the number of disparity levels and returns the call that is timed.
     bytes_per_cell : int
         Known memory per pixel and level, to leave it out where the machine cannot hold it; 0 if little or unknown.
-    most_rounds : int or None
-        It is not called more often than this.
+    max_rounds : int or None
+        Largest number of timed calls.
     """
 
     name: str
     module: str
     make: Callable[[int], Call]
     bytes_per_cell: int = 0
-    most_rounds: int | None = None
+    max_rounds: int | None = None
 
 
 def _opencv(mode: int) -> Callable[[int], Call]:
@@ -114,46 +114,46 @@ def _pandora(levels: int) -> Call:
     def dataset(image: NDArray[np.uint8], disparities: list[int]) -> Any:
         coordinates = {"row": np.arange(image.shape[0]), "col": np.arange(image.shape[1])}
         attributes = {"no_data_img": 0, "valid_pixels": 0, "no_data_mask": 1, "crs": None, "transform": None}
-        found = xarray.Dataset({"im": (["row", "col"], image.astype(np.float32))}, coordinates, attributes)
-        return add_disparity(found, disparities, None)
+        view = xarray.Dataset({"im": (["row", "col"], image.astype(np.float32))}, coordinates, attributes)
+        return add_disparity(view, disparities, None)
 
     def call(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[Any]:
         pair = dataset(left, [1 - levels, 0]), dataset(right, [0, levels - 1])  # its disparities are negative
         machine = new_machine()
-        settings = check({"pipeline": steps}, *(one.assign_coords(band_im=[None]) for one in pair), machine)
-        found, _ = pandora.run(machine, *pair, settings)
-        return -np.asarray(found["disparity_map"].values)
+        settings = check({"pipeline": steps}, *(view.assign_coords(band_im=[None]) for view in pair), machine)
+        maps, _ = pandora.run(machine, *pair, settings)
+        return -np.asarray(maps["disparity_map"].values)
 
     return call
 
 
 # The full modes keep two volumes of int16, costs and sums, for the whole image.
-PEERS: dict[str, Peer] = {
-    peer.name: peer
-    for peer in (
-        Peer("OpenCV SGBM", "cv2", _opencv(cv2.STEREO_SGBM_MODE_SGBM)),
-        Peer(THREE_WAY, "cv2", _opencv(cv2.STEREO_SGBM_MODE_SGBM_3WAY)),
-        Peer(HH, "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH), 4),
-        Peer("OpenCV HH4", "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH4), 4),
-        Peer("pandora libSGM", "pandora_plugin_libsgm", _pandora, 26, 3),
+BASELINES: dict[str, Baseline] = {
+    baseline.name: baseline
+    for baseline in (
+        Baseline("OpenCV SGBM", "cv2", _opencv(cv2.STEREO_SGBM_MODE_SGBM)),
+        Baseline(THREE_WAY, "cv2", _opencv(cv2.STEREO_SGBM_MODE_SGBM_3WAY)),
+        Baseline(HH, "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH), 4),
+        Baseline("OpenCV HH4", "cv2", _opencv(cv2.STEREO_SGBM_MODE_HH4), 4),
+        Baseline("pandora libSGM", "pandora_plugin_libsgm", _pandora, 26, 3),
     )
 }
-"""Peers by name: OpenCV's semi-global matcher in 5, 3, 8 and 4 directions, and pandora's."""
+"""Baselines by name: OpenCV's semi-global matcher in 5, 3, 8 and 4 directions, and pandora's."""
 
 
-def peers() -> list[str]:
-    """Return the names of the peers whose module is installed."""
-    return [peer.name for peer in PEERS.values() if find_spec(peer.module) is not None]
+def baselines() -> list[str]:
+    """Return the names of the baselines whose module is installed."""
+    return [baseline.name for baseline in BASELINES.values() if find_spec(baseline.module) is not None]
 
 
 def usable_levels(levels: int) -> int:
-    """Return the levels that OpenCV takes for `levels`: the next multiple of 16."""
+    """Return OpenCV's number of levels for `levels`: the next multiple of 16."""
     return -(-levels // 16) * 16
 
 
 def label(key: str) -> str:
-    """Return what the table calls a contender: a peer's name, or such as ``"S2 census+sgm"``."""
-    if key in PEERS:
+    """Return a contender's name in the table: that of a baseline, or such as ``"S2 census+sgm"``."""
+    if key in BASELINES:
         return key
     return " ".join([*(short for short, name in METHODS.items() if name == key), key])
 
@@ -164,7 +164,7 @@ def make(key: str, levels: int, threads: int) -> Call:
     Parameters
     ----------
     key : str
-        A peer's name, or a method of stereokit, which runs with its default options.
+        The name of a baseline, or a method of stereokit, which runs with its default options.
     levels : int
         Disparities 0 to `levels` - 1.
     threads : int
@@ -173,10 +173,10 @@ def make(key: str, levels: int, threads: int) -> Call:
     Raises
     ------
     UnknownNameError
-        If there is no such peer or method.
+        If there is no such baseline or method.
     """
-    if key in PEERS:
-        return PEERS[key].make(levels)
+    if key in BASELINES:
+        return BASELINES[key].make(levels)
     matcher = Matcher(key, max_disparity=levels, threads=threads, device="cpu")
     return lambda left, right: matcher(left, right).disparity
 
@@ -193,7 +193,7 @@ def opencv_threads(threads: int) -> Iterator[None]:
 
 
 def padded(key: str, levels: int) -> Callable[[NDArray[Any], NDArray[Any]], Disparity]:
-    """Return an OpenCV peer as a matcher that gives the leftmost columns a disparity too.
+    """Return an OpenCV baseline as a matcher that gives the leftmost columns a disparity too.
 
     Both images are extended on the left by as many columns as there are levels, with copies of the border pixel,
     and the map is cropped; without that OpenCV leaves these columns without a value.
@@ -201,11 +201,11 @@ def padded(key: str, levels: int) -> Callable[[NDArray[Any], NDArray[Any]], Disp
     Parameters
     ----------
     key : str
-        A name in `PEERS` that starts with OpenCV.
+        A name in `BASELINES` that starts with OpenCV.
     levels : int
         Disparities 0 to `levels` - 1, rounded up to a multiple of 16.
     """
-    compute, columns = PEERS[key].make(levels), usable_levels(levels)
+    compute, columns = BASELINES[key].make(levels), usable_levels(levels)
 
     def match(left: NDArray[Any], right: NDArray[Any]) -> Disparity:
         wide: list[Any] = [cv2.copyMakeBorder(image, 0, 0, columns, 0, cv2.BORDER_REPLICATE) for image in (left, right)]

@@ -12,11 +12,11 @@ from stereokit.errors import FileError, OptionError, UnknownNameError
 from stereokit.registry import REFINERS
 from stereokit_evaluation.study import configurations
 from stereokit_evaluation.study.configurations import (
+    available_variants,
+    baseline,
     build,
     describe_error,
-    parse_setting,
-    peer,
-    settings_at_hand,
+    parse_variant,
     title,
 )
 from stereokit_refiners import Linear
@@ -50,10 +50,10 @@ def test_settings_have_the_papers_names(refiner):
         "Mini+CNN",
         "Mini+mine",
     ]
-    assert {"linear", "original", "cnn", "stereovae", "mine"} <= set(settings_at_hand())
-    assert parse_setting(" Mini+Linear ") == "linear" and parse_setting("MINE") == "mine"
-    with pytest.raises(UnknownNameError, match="no setting named 'orignal'; did you mean 'original'"):
-        parse_setting("orignal")
+    assert {"linear", "original", "cnn", "stereovae", "mine"} <= set(available_variants())
+    assert parse_variant(" Mini+Linear ") == "linear" and parse_variant("MINE") == "mine"
+    with pytest.raises(UnknownNameError, match="no variant named 'orignal'; did you mean 'original'"):
+        parse_variant("orignal")
 
 
 def test_the_grid_is_methods_times_settings():
@@ -68,7 +68,7 @@ def test_a_refiner_that_is_not_there_is_missing_with_the_reason(refiner):
         raise ModuleNotFoundError("No module named 'openvino'", name="openvino")
 
     refiner("cnn", no_runtime)
-    cells = {cell.setting: cell for cell in build(["S2"], ["linear", "cnn", "stereovae"], {})}
+    cells = {cell.variant: cell for cell in build(["S2"], ["linear", "cnn", "stereovae"], {})}
     assert cells["linear"].missing is None
     assert cells["cnn"].missing == "needs the package 'openvino', which is not installed"
     assert cells["stereovae"].missing == "no refiner named 'stereovae' is installed"
@@ -96,8 +96,8 @@ def test_bad_options_are_the_users_and_make_nothing_missing(options):
 
 
 def test_threads_do_not_change_what_a_map_depends_on():
-    one, two = (identities(build(["S4"], ["original", "linear"], {"threads": n})) for n in (1, 2))
-    assert one == two
+    first, second = (identities(build(["S4"], ["original", "linear"], {"threads": n})) for n in (1, 2))
+    assert first == second
 
 
 def test_weights_belong_to_the_identity(refiner, monkeypatch):
@@ -140,13 +140,13 @@ def test_options_of_a_refiner_go_to_it_alone(refiner):
 
 
 def test_a_weight_file_is_a_setting(tmp_path):
-    with pytest.raises(FileError, match="setting must name a weight file that exists"):
-        parse_setting(str(tmp_path / "none.safetensors"))
+    with pytest.raises(FileError, match="variant must name a weight file that exists"):
+        parse_variant(str(tmp_path / "none.safetensors"))
     (tmp_path / "mine.safetensors").write_bytes(b"not weights")
-    setting = parse_setting(str(tmp_path / "mine.safetensors"))
+    setting = parse_variant(str(tmp_path / "mine.safetensors"))
     (cell,) = build(["S2"], [setting], {})
     assert cell.name == "S2 Mini+mine" and cell.matcher is None and cell.missing
-    assert "file" not in settings_at_hand()
+    assert "file" not in available_variants()
 
 
 def test_fingerprints_follow_content(tmp_path):
@@ -163,14 +163,14 @@ def test_a_module_of_its_own_is_its_file_and_not_the_folder_around_it(tmp_path, 
     (tmp_path / "lone_refiner.py").write_text("class Lone:\n    pass\n")
     (tmp_path / "neighbour.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
-    made = importlib.import_module("lone_refiner").Lone()
-    before = configurations._weights(made)
+    refiner = importlib.import_module("lone_refiner").Lone()
+    before = configurations._weights(refiner)
     configurations.fingerprint.cache_clear()
     (tmp_path / "neighbour.py").write_text("changed = True")
-    assert configurations._weights(made) == before
+    assert configurations._weights(refiner) == before
     configurations.fingerprint.cache_clear()
     (tmp_path / "lone_refiner.py").write_text("class Lone:\n    changed = True\n")
-    assert configurations._weights(made) != before
+    assert configurations._weights(refiner) != before
 
 
 def test_errors_are_one_line():
@@ -182,7 +182,7 @@ def test_errors_are_one_line():
 def test_opencv_gets_its_leftmost_columns_too(random_pair):
     left, _ = random_pair(40, 120)
     right = np.roll(left, -6, axis=1)
-    found = peer("OpenCV HH", 20).matcher(left, right)
-    assert found.disparity.shape == left.shape
-    assert abs(np.nanmedian(found.disparity[:, 40:]) - 6) < 0.5
-    assert np.isfinite(found.disparity[:, 6:12]).mean() > 0.5  # unpadded, the first 32 columns have none
+    result = baseline("OpenCV HH", 20).matcher(left, right)
+    assert result.disparity.shape == left.shape
+    assert abs(np.nanmedian(result.disparity[:, 40:]) - 6) < 0.5
+    assert np.isfinite(result.disparity[:, 6:12]).mean() > 0.5  # unpadded, the first 32 columns have none

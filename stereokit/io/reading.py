@@ -28,8 +28,8 @@ _LONGEST_REASON = 200
 def parsing(path: str | os.PathLike[str], kind: str, rule: str | None = None) -> Iterator[None]:
     """Turn every exception of a ``with`` block into a `FileError` that names the file.
 
-    An interrupt passes, and so do a `FileError` and a warning of ours. A lack of memory counts as a fault of the file, whose
-    header states its size.
+    An interrupt passes, and so do a `FileError` and a warning of ours. A lack of memory counts as a fault of the file,
+    whose header states its size.
 
     Parameters
     ----------

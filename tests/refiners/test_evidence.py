@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from refining import weight_file
 
 import stereokit
 from stereokit.errors import OptionError
@@ -357,9 +358,10 @@ def test_what_does_not_fit_is_refused(change, message):
         _refiner()(coarse, left, **{"right": right, **change})
 
 
-def test_other_networks_refuse_other_scales():
+def test_other_networks_refuse_other_scales(tmp_path):
+    weights = weight_file(tmp_path, "stereovae")
     with pytest.raises(OptionError, match=r"refiner 'stereovae' needs scale=0.5, got scale=0.25"):
-        stereokit.Matcher("S2", scale=0.25, refiner="stereovae", device="cpu")
+        stereokit.Matcher("S2", scale=0.25, refiner="stereovae", weights=weights, device="cpu")
 
 
 def _scene():

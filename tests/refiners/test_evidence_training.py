@@ -121,4 +121,4 @@ def test_a_short_run_learns_goes_on_and_gives_weights_that_are_read(tmp_path, mo
         np.testing.assert_allclose(other.arrays[name], array, rtol=1e-5)
     assert content.notes["steps"] == 22
     assert read(output).fingerprint == content.fingerprint
-    assert set(content.ranges) > {"stem", "merge_0"}
+    assert set(content.ranges) > {"stem", "merge_1"}

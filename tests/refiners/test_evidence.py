@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from refining import weight_file
+from refining import tuned_to_kitti
 
 import stereokit
 from stereokit.errors import OptionError
@@ -358,10 +358,10 @@ def test_what_does_not_fit_is_refused(change, message):
         _refiner()(coarse, left, **{"right": right, **change})
 
 
-def test_other_networks_refuse_other_scales(tmp_path):
-    weights = weight_file(tmp_path, "stereovae")
+def test_other_networks_refuse_other_scales():
+    tuned_to_kitti("stereovae")
     with pytest.raises(OptionError, match=r"refiner 'stereovae' needs scale=0.5, got scale=0.25"):
-        stereokit.Matcher("S2", scale=0.25, refiner="stereovae", weights=weights, device="cpu")
+        stereokit.Matcher("S2", scale=0.25, refiner="stereovae", weights="kitti", device="cpu")
 
 
 def _scene():
@@ -408,9 +408,9 @@ def _plane(first, slope):
 @pytest.mark.parametrize(("scale", "most"), [(1, 0.05), (0.5, 0.05), (0.25, 0.09)])
 def test_shipped_weights_have_no_bias_on_planes(scale, most, first, slope):
     left, right, truth = _plane(first, slope)
-    found = stereokit.match(left, right, "S2", max_disparity=96, scale=scale, refiner="general", device="cpu")
+    disparity = stereokit.match(left, right, "S2", max_disparity=96, scale=scale, refiner="general", device="cpu")
     seen = np.arange(truth.shape[1]) >= truth
-    assert abs(float(np.median((found - truth)[seen]))) < most
+    assert abs(float(np.median((disparity - truth)[seen]))) < most
 
 
 def test_shipped_weights_follow_an_offset_of_all_disparities():

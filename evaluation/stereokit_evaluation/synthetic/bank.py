@@ -1,4 +1,4 @@
-"""A bank of grey textures, each made from its kind and number alone when first asked for.
+"""A bank of grey textures, each computed from its kind and number alone at its first use.
 
 A scene takes a few, scales, turns, mixes and recolours them, so that a few hundred give no two surfaces alike.
 """
@@ -48,7 +48,7 @@ Left out, because scikit-image names no clear terms: coins, moon, page, immunohi
 
 
 def _levelled(field: Float, deviation: float = 45.0) -> Bytes:
-    """Return a field as bytes of mean 128 and the given standard deviation."""
+    """Return a field as bytes of mean 128 and standard deviation `deviation`."""
     field = field - field.mean()
     return np.clip(np.rint(128 + field * (deviation / max(float(field.std()), 1e-9))), 0, 255).astype(np.uint8)
 

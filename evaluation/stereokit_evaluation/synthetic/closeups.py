@@ -1,4 +1,4 @@
-"""Close-ups of smooth, curved, wet or matt surfaces lit by a lamp beside the camera, as an endoscope sees them."""
+"""Close-ups of smooth, curved, wet or matt surfaces lit by a lamp next to the camera, as in an endoscope."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def closeup(stage: Stage) -> None:
         angle = np.linspace(0, 2 * np.pi, turns + 1)
         radius = half * rng.uniform(0.5, 0.9) * np.ones((length, turns + 1))
         for _ in range(int(rng.integers(3, 9))):  # folds that narrow it
-            at, depth = rng.uniform(4, 60), rng.uniform(0.1, 0.5)
+            center, depth = rng.uniform(4, 60), rng.uniform(0.1, 0.5)
             lean = 1 + 0.5 * np.cos(angle - rng.uniform(0, 6))
-            radius *= 1 - depth * lean[None] / 1.5 * np.exp(-(((along - at) / rng.uniform(0.6, 2.5)) ** 2))[:, None]
+            radius *= 1 - depth * lean[None] / 1.5 * np.exp(-(((along - center) / rng.uniform(0.6, 2.5)) ** 2))[:, None]
         wobble = relief(rng, 128, 2.0)[:96, :96] * 0.04
         radius *= 1 + np.pad(np.concatenate([wobble, wobble[::-1]])[:length], ((0, 0), (0, 1)), mode="wrap")
         bend_x, bend_y = rng.normal(0, 0.004, 2)

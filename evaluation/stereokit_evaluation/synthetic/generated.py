@@ -61,7 +61,7 @@ class GeneratedPair:
     seen : (H, W) bool
         Whether the right view shows the point at a left pixel's centre: it lies inside, and nothing covers it.
     kind, seed : str and int
-        What made it.
+        The seed of the scene.
     """
 
     left: NDArray[np.uint8]
@@ -156,12 +156,12 @@ def generate_pair(seed: int, kind: str | None = None, *, size: tuple[int, int] |
         right=right,
     )
     if kind == "street":
-        made = _street(seed, width, height, rig.largest, (left, right), noise)
+        pair = _street(seed, width, height, rig.largest, (left, right), noise)
     else:
         stage = Stage(world)
         _MAKERS[kind](stage)
-        made = render(stage, rig, noise)
-    return GeneratedPair(made.left, made.right, made.truth, made.seen, kind, seed)
+        pair = render(stage, rig, noise)
+    return GeneratedPair(pair.left, pair.right, pair.truth, pair.seen, kind, seed)
 
 
 def pairs(
@@ -178,8 +178,8 @@ def pairs(
     kind : str, optional
         Of all of them, else each seed draws its own.
     folder : Path, optional
-        Where pairs are kept, one file each, named by kind, seed and a digest of the sources; what is there already is
-        read, not rendered. A run that was stopped goes on where it was.
+        Folder of the pairs, one file each, named by kind, seed and a digest of the sources; existing files are read,
+        not rendered. A stopped run resumes where it ended.
 
     Yields
     ------

@@ -50,7 +50,7 @@ class Patch:
     width_m, height_m : float
         Extent in metres.
     look : Look
-        What is painted on it.
+        The appearance.
     object_id : int
         0 for background, else the number of the object it belongs to.
     mask : (h, w) bool or None
@@ -80,7 +80,7 @@ class Plane:
     box : tuple of 4 float
         Smallest and largest x, smallest and largest y of the rectangle in this view.
     patch : Patch
-        What it was made from.
+        The patch in space.
     """
 
     disparity: Float
@@ -97,13 +97,13 @@ def _corners(patch: Patch) -> Float:
     origin, u, v = (np.asarray(p, np.float64) for p in (patch.origin, patch.u_axis, patch.v_axis))
     u, v = u * patch.width_m, v * patch.height_m
     ring = [origin, origin + u, origin + u + v, origin + v]
-    kept: list[Float] = []
+    corners: list[Float] = []
     for p, q in zip(ring, ring[1:] + ring[:1], strict=True):
         if p[2] >= _NEAR_M:
-            kept.append(p)
+            corners.append(p)
         if (p[2] >= _NEAR_M) != (q[2] >= _NEAR_M):
-            kept.append(p + (q - p) * (_NEAR_M - p[2]) / (q[2] - p[2]))
-    return np.array(kept, np.float64).reshape(-1, 3)
+            corners.append(p + (q - p) * (_NEAR_M - p[2]) / (q[2] - p[2]))
+    return np.array(corners, np.float64).reshape(-1, 3)
 
 
 def plane_of(patch: Patch, camera: Camera, *, right: bool = False) -> Plane | None:

@@ -173,14 +173,14 @@ def _vessels(rng: Rng) -> Float:
     """Return dark branching lines on a cloudy ground: living tissue, marble, cracks."""
     image = np.zeros((SIZE, SIZE), np.uint8)
     for _ in range(int(rng.integers(6, 40))):
-        at, angle = rng.uniform(0, SIZE, 2), rng.uniform(0, 2 * np.pi)
+        position, angle = rng.uniform(0, SIZE, 2), rng.uniform(0, 2 * np.pi)
         thick = float(rng.uniform(1, 7))
         for _ in range(int(rng.integers(20, 120))):
             angle += rng.normal(0, 0.35)
-            to = at + 7 * np.array([np.cos(angle), np.sin(angle)])
-            p, q = (tuple(int(v) for v in np.rint(e)) for e in (at, to))
+            to = position + 7 * np.array([np.cos(angle), np.sin(angle)])
+            p, q = (tuple(int(v) for v in np.rint(e)) for e in (position, to))
             cv2.line(image, p, q, int(rng.integers(60, 255)), max(int(thick), 1), cv2.LINE_8)
-            at, thick = to, thick * 0.985
+            position, thick = to, thick * 0.985
     soft = cv2.blur(cv2.blur(image, (3, 3)), (3, 3)).astype(np.float64)
     f = _frequencies()
     return -soft / 60 * rng.uniform(0.3, 1.5) + _unit(_spectral(rng, 1 / np.maximum(f, 1.0) ** rng.uniform(1.4, 2.4)))

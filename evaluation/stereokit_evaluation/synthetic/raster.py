@@ -1,4 +1,4 @@
-"""What each sample of a view shows: triangles in homogeneous coordinates, exact at any position.
+"""The visible triangle at each sample of a view: homogeneous coordinates, exact at any position.
 
 A triangle with the corners ``v0, v1, v2`` (camera coordinates, Z forward) covers the ray ``p = (x, y, 1)`` where the
 three products ``(v1 x v2) . p``, ``(v2 x v0) . p``, ``(v0 x v1) . p`` have one sign; their sum over the determinant is
@@ -101,7 +101,7 @@ def _span(edges: Any, py: float) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut(uv: Float, face: Any, e0: float, e1: float, e2: float, mask: Any) -> bool:
-    """Return whether a cut-out mask has a hole at a point, given by its weights at the corners."""
+    """Return whether a cut-out mask has a hole at a point; the point is the weights of the corners."""
     total = e0 + e1 + e2
     s = (e0 * uv[face[0], 2] + e1 * uv[face[1], 2] + e2 * uv[face[2], 2]) / total
     t = (e0 * uv[face[0], 3] + e1 * uv[face[1], 3] + e2 * uv[face[2], 3]) / total

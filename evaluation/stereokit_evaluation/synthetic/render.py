@@ -61,7 +61,7 @@ class Rendered:
 
 
 def _shadows(scene: Triangles, stage: Stage, sun: Float) -> tuple[Float, Float, float]:
-    """Return what the sun sees: inverse depths, its camera as (3, 4), and its focal length."""
+    """Return the view of the sun: inverse depths, its camera as (3, 4), and its focal length."""
     centre = (stage.shadow_centre - stage.place) @ stage.turn
     forward = -sun
     aside = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.9 else [1.0, 0.0, 0.0])

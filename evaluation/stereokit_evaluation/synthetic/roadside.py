@@ -1,4 +1,4 @@
-"""What stands along roads and in yards: cars, fronts of houses, hedges, fences, poles."""
+"""Objects along roads and in yards: cars, fronts of houses, hedges, fences, poles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["car", "fence", "front", "hedge", "pole"]
 Float = NDArray[np.float64]
 
 
-def car(stage: Stage, at: Float, yaw: float) -> None:
+def car(stage: Stage, position: Float, yaw: float) -> None:
     """Add a car: glossy, often dark paint without texture; panes that mirror the sky."""
     rng = stage.rng
     turn = rotation(yaw)
@@ -45,7 +45,7 @@ def car(stage: Stage, at: Float, yaw: float) -> None:
         coat,
         None,
         turn @ np.diag([width / 2, (waist - low) / 2, length / 2]),
-        at + np.array([0, -(waist + low) / 2, 0]),
+        position + np.array([0, -(waist + low) / 2, 0]),
     )
     shift = turn @ np.array([0, 0, length * rng.uniform(-0.05, 0.1)])
     roof = float(rng.uniform(0.27, 0.4))
@@ -54,26 +54,28 @@ def car(stage: Stage, at: Float, yaw: float) -> None:
         pane,
         None,
         turn @ np.diag([width * 0.44, height * 0.42, length * roof]),
-        at + np.array([0, -waist, 0]) + shift,
+        position + np.array([0, -waist, 0]) + shift,
     )
-    stage.add(box(width * 0.72, 0.05, length * roof * 1.2), coat, None, turn, at + np.array([0, -height, 0]) + shift)
+    stage.add(
+        box(width * 0.72, 0.05, length * roof * 1.2), coat, None, turn, position + np.array([0, -height, 0]) + shift
+    )
     for sx in (-1, 1):
         for k in (-0.35, 0.35):
             post = turn @ np.array([sx * width * 0.42, -(waist + height) / 2, k * length * roof * 2])
             lean = rotation(0, float(np.sign(k)) * 0.35)
-            stage.add(box(0.07, (height - waist) * 1.05, 0.09), coat, None, turn @ lean, at + post + shift)
+            stage.add(box(0.07, (height - waist) * 1.05, 0.09), coat, None, turn @ lean, position + post + shift)
     seat = stage.paint(size=1.0, albedo=float(rng.uniform(0.02, 0.3)))
     for aside in (-0.22, 0.22):
         for k in (-0.2, 0.15):
             chair = turn @ np.array([aside * width, -waist - 0.12, k * length * roof * 2])
-            stage.add(box(0.5, 0.6, 0.15), seat, None, turn, at + chair + shift)
-            stage.add(box(0.25, 0.22, 0.1), seat, None, turn, at + chair + shift - [0, 0.42, 0])
+            stage.add(box(0.5, 0.6, 0.15), seat, None, turn, position + chair + shift)
+            stage.add(box(0.25, 0.22, 0.1), seat, None, turn, position + chair + shift - [0, 0.42, 0])
     tyre = stage.paint("fractal", 0.5, 0.05, 0.05, plain=False)
     rim = stage.paint("collage", 0.8, 0.5, 0.6, plain=False)
     radius = height * 0.2
     for sx in (-1, 1):
         for sz in (-1, 1):
-            spot = at + turn @ np.array([sx * width * 0.47, -radius, sz * length * 0.32])
+            spot = position + turn @ np.array([sx * width * 0.47, -radius, sz * length * 0.32])
             side = turn @ rotation(0, 0, np.pi / 2)
             stage.add(
                 lathe(np.array([1e-6, radius, radius, 1e-6]), np.array([-0.12, -0.12, 0.12, 0.12]), 24),
@@ -93,18 +95,18 @@ def car(stage: Stage, at: Float, yaw: float) -> None:
     for sz in (-1, 1):
         for sx in (-1, 1):
             spot = turn @ np.array([sx * width * 0.36, -waist * 0.78, sz * length * 0.495])
-            stage.add(box(0.35, 0.16, 0.06), lights, None, turn, at + spot)
+            stage.add(box(0.35, 0.16, 0.06), lights, None, turn, position + spot)
         stage.add(
             sheet(0.5, 0.12),
             stage.paint("print", 0.4, 0.7, 0.8, plain=False),
             None,
             turn,
-            at + turn @ np.array([0, -waist * 0.55, sz * (length * 0.505)]),
+            position + turn @ np.array([0, -waist * 0.55, sz * (length * 0.505)]),
         )
 
 
-def front(stage: Stage, width: float, height: float, at: Float, yaw: float) -> None:
-    """Add the front of a house, with sills, balconies, pillars, pipes; `at` is the middle of its foot."""
+def front(stage: Stage, width: float, height: float, position: Float, yaw: float) -> None:
+    """Add the front of a house, with sills, balconies, pillars, pipes; `position` is the middle of its foot."""
     rng = stage.rng
     turn = rotation(yaw)
     wall = stage.paint(
@@ -114,7 +116,7 @@ def front(stage: Stage, width: float, height: float, at: Float, yaw: float) -> N
         float(rng.uniform(0.4, 1.4)),
         gloss=float(rng.choice([0, 0, 0.3])),
     )
-    stage.add(box(width, height * 2, 8.0), wall, None, turn, at + turn @ np.array([0, 0, 4.0]))
+    stage.add(box(width, height * 2, 8.0), wall, None, turn, position + turn @ np.array([0, 0, 4.0]))
     trim = stage.paint("fractal", 1.0, float(rng.uniform(0.3, 0.8)), plain=bool(rng.random() < 0.6))
     pitch = float(rng.uniform(2.0, 4.0))
     kind = rng.random()
@@ -133,7 +135,7 @@ def front(stage: Stage, width: float, height: float, at: Float, yaw: float) -> N
                         box(0.03, 0.9, 0.03).moved(None, (x - 0.75 + 0.15 * j, y - 0.15, -0.98)) for j in range(11)
                     )
     if parts:
-        stage.add(merge(parts), trim, None, turn, at)
+        stage.add(merge(parts), trim, None, turn, position)
     if rng.random() < 0.35:  # panes that mirror what is around, which matches elsewhere
         pane = stage.paint(
             "facade",
@@ -153,7 +155,7 @@ def front(stage: Stage, width: float, height: float, at: Float, yaw: float) -> N
             for storey in range(int(height / 3))
         ]
         if panes:
-            stage.add(merge(panes), pane, None, turn, at)
+            stage.add(merge(panes), pane, None, turn, position)
 
 
 def hedge(stage: Stage, a: Float, b: Float, height: float) -> None:
@@ -190,13 +192,19 @@ def fence(stage: Stage, a: Float, b: Float, height: float) -> None:
     stage.add(merge(posts), coat)
 
 
-def pole(stage: Stage, at: Float) -> None:
+def pole(stage: Stage, position: Float) -> None:
     """Add a pole: a sign, a lantern, or bare."""
     rng = stage.rng
     height = float(rng.uniform(2.2, 7))
     metal = stage.paint("fractal", 0.5, plain=True, gloss=0.5)
     stage.add(
-        tube(np.stack([at, at - [0, height, 0]]), float(rng.uniform(0.025, 0.12)), 8, float(rng.uniform(0.5, 1))), metal
+        tube(
+            np.stack([position, position - [0, height, 0]]),
+            float(rng.uniform(0.025, 0.12)),
+            8,
+            float(rng.uniform(0.5, 1)),
+        ),
+        metal,
     )
     kind = rng.random()
     if kind < 0.5:
@@ -206,9 +214,9 @@ def pole(stage: Stage, at: Float) -> None:
             sign,
             str(rng.choice(["disc", "star"])) if rng.random() < 0.6 else None,
             rotation(float(rng.normal(0, 0.4))),
-            at + np.array([0, -height + 0.3, -0.1]),
+            position + np.array([0, -height + 0.3, -0.1]),
         )
     elif kind < 0.75:
-        tip = at + np.array([rng.uniform(-2, 2), -height - 0.3, 0])
-        stage.add(tube(np.stack([at - [0, height, 0], tip]), 0.04, 6), metal)
+        tip = position + np.array([rng.uniform(-2, 2), -height - 0.3, 0])
+        stage.add(tube(np.stack([position - [0, height, 0], tip]), 0.04, 6), metal)
         stage.add(blob(0.25, steps=8), metal, None, None, tip)

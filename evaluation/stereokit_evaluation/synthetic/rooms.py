@@ -83,16 +83,16 @@ def room(stage: Stage) -> None:
         return np.array([np.clip(rng.uniform(-0.8, 0.8) * z + stage.place[0], -half + margin, half - margin), 0.0, z])
 
     for _ in range(int(rng.integers(0, 4))):
-        at, yaw = spot(0.8), float(rng.uniform(-3, 3))
+        position, yaw = spot(0.8), float(rng.uniform(-3, 3))
         size = float(rng.uniform(0.7, 1.2))
-        w, d = table(stage, size, at, yaw)
+        w, d = table(stage, size, position, yaw)
         for _ in range(int(rng.integers(0, 9))):
             place = rotation(yaw) @ np.array([rng.uniform(-0.45, 0.45) * w, 0, rng.uniform(-0.45, 0.45) * d])
             thing = float(rng.uniform(0.08, 0.4))
             solid(
                 stage,
                 thing,
-                at + place + np.array([0, -0.77 * size - thing * 0.45, 0]),
+                position + place + np.array([0, -0.77 * size - thing * 0.45, 0]),
                 rotation(float(rng.uniform(-3, 3))),
             )
     for _ in range(int(rng.integers(0, 6))):
@@ -107,11 +107,11 @@ def room(stage: Stage) -> None:
     for _ in range(int(rng.integers(0, 3))):
         side, w = int(rng.integers(3)), float(rng.uniform(0.6, 2.0))
         if side == 0:
-            at, yaw = np.array([rng.uniform(-half + 1, half - 1), 0, depth - 0.2]), 0.0
+            position, yaw = np.array([rng.uniform(-half + 1, half - 1), 0, depth - 0.2]), 0.0
         else:
             sign = -1 if side == 1 else 1
-            at, yaw = np.array([sign * (half - 0.2), 0, rng.uniform(1.8, depth - 1)]), sign * quarter
-        bookshelf(stage, w, float(rng.uniform(0.8, height - 0.2)), at, yaw)
+            position, yaw = np.array([sign * (half - 0.2), 0, rng.uniform(1.8, depth - 1)]), sign * quarter
+        bookshelf(stage, w, float(rng.uniform(0.8, height - 0.2)), position, yaw)
     for _ in range(int(rng.integers(0, 12))):
         size = float(np.exp(rng.uniform(np.log(0.15), np.log(1.0))))
         solid(stage, size, spot() + np.array([0, -size / 2, 0]), rotation(float(rng.uniform(-3, 3))))
@@ -184,12 +184,16 @@ def hall(stage: Stage) -> None:
         for _ in range(6)
     ]
     for _ in range(int(rng.integers(3, 25))):  # crates in stacks
-        at, yaw = spot(), rotation(float(rng.normal(0, 0.5)))
+        position, yaw = spot(), rotation(float(rng.normal(0, 0.5)))
         y = 0.0
         for _ in range(int(rng.integers(1, 5))):
             w, h, d = rng.uniform(0.3, 1.2, 3)
             stage.add(
-                box(w, h, d), coats[int(rng.integers(6))], None, yaw, at + np.array([rng.normal(0, 0.05), y - h / 2, 0])
+                box(w, h, d),
+                coats[int(rng.integers(6))],
+                None,
+                yaw,
+                position + np.array([rng.normal(0, 0.05), y - h / 2, 0]),
             )
             y -= h
     steel = stage.paint("fractal", 1.0, gloss=0.7, plain=bool(rng.random() < 0.7))

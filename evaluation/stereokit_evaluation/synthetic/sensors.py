@@ -1,4 +1,4 @@
-"""What a pair of real cameras does to the light: blur, defocus, vignetting, noise, exposure, gamma, JPEG.
+"""The imperfections of a pair of real cameras: blur, defocus, vignetting, noise, exposure, gamma, JPEG.
 
 All sums are float64 in a fixed order, so that the bytes do not depend on the processor's vectors.
 """
@@ -136,12 +136,12 @@ def _defocused(fine: NDArray[np.float64], spread: NDArray[np.float64], base: flo
     """Return the image blurred by `base` and `spread` (of each sample) together, from four blurs mixed."""
     steps = base + np.array([0.0, 1.0, 2.5, 5.0])
     layers = [blurred(fine, float(step)) for step in steps]
-    at = np.clip(base + spread, steps[0], steps[-1])
+    positions = np.clip(base + spread, steps[0], steps[-1])
     out = layers[0]
     for k in range(3):
-        share = np.clip((at - steps[k]) / (steps[k + 1] - steps[k]), 0, 1)
+        share = np.clip((positions - steps[k]) / (steps[k + 1] - steps[k]), 0, 1)
         mixed = (1 - share) * layers[k] + share * layers[k + 1]
-        out = np.asarray(np.where(at > steps[k], mixed, out), np.float64)
+        out = np.asarray(np.where(positions > steps[k], mixed, out), np.float64)
     return out
 
 

@@ -73,9 +73,9 @@ def _sample(bank: Any, slot: int, u: float, v: float, level: int) -> float:
     ax, ay = x - fx, y - fy
     x0, y0 = int(fx) & (side - 1), int(fy) & (side - 1)
     x1, y1 = (x0 + 1) & (side - 1), (y0 + 1) & (side - 1)
-    at = slot * _STRIDE + _STARTS[level]
-    top = (1 - ax) * bank[at + y0 * side + x0] + ax * bank[at + y0 * side + x1]
-    low = (1 - ax) * bank[at + y1 * side + x0] + ax * bank[at + y1 * side + x1]
+    start = slot * _STRIDE + _STARTS[level]
+    top = (1 - ax) * bank[start + y0 * side + x0] + ax * bank[start + y0 * side + x1]
+    low = (1 - ax) * bank[start + y1 * side + x0] + ax * bank[start + y1 * side + x1]
     return float(((1 - ay) * top + ay * low) / 255.0 - 0.5)
 
 
@@ -90,7 +90,7 @@ def _level(footprint: float) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _around(bank: Any, light: Float, x: float, y: float, z: float) -> float:
-    """Return what lies in a direction around the scene, on an octahedron unfolded to a square."""
+    """Return the surroundings of the scene in a direction, on an octahedron unfolded to a square."""
     total = abs(x) + abs(y) + abs(z) + 1e-12
     u, v = x / total, z / total
     if y > 0:
@@ -189,8 +189,8 @@ def shade(
             if m < -1:
                 out[r, k] = 0
                 continue
-            beside = k + 1 if r % 2 else k - 1
-            if r % 2 != k % 2 and 0 <= beside < columns and shown[r, beside] == m:
+            neighbour = k + 1 if r % 2 else k - 1
+            if r % 2 != k % 2 and 0 <= neighbour < columns and shown[r, neighbour] == m:
                 continue  # two of a pixel's four samples do where it shows one triangle: see below
             px = (x0 + k * dx - cx) / focal
             # the ray in the left camera's axes
@@ -302,7 +302,7 @@ def shade(
                 value = value * clear + light[20] * (1 - clear)
             out[r, k] = value
         for k in range(columns):
-            beside = k + 1 if r % 2 else k - 1
-            if r % 2 != k % 2 and 0 <= beside < columns and shown[r, beside] == shown[r, k]:
-                out[r, k] = out[r, beside]
+            neighbour = k + 1 if r % 2 else k - 1
+            if r % 2 != k % 2 and 0 <= neighbour < columns and shown[r, neighbour] == shown[r, k]:
+                out[r, k] = out[r, neighbour]
     return out

@@ -39,14 +39,14 @@ _DARK: Colour = (26, 26, 29)
 
 
 def rectangle(image: Bytes, scale: float, u0: float, v0: float, u1: float, v1: float, colour: Any) -> None:
-    """Fill a rectangle given in metres, `scale` pixels each."""
+    """Fill a rectangle in metres, `scale` pixels each."""
     a, b = (round(u0 * scale), round(v0 * scale)), (round(u1 * scale) - 1, round(v1 * scale) - 1)
     if b[0] >= a[0] and b[1] >= a[1]:
         cv2.rectangle(image, a, b, tuple(float(c) for c in np.atleast_1d(colour)), -1)
 
 
 def polygon(image: Bytes, scale: float, points: Any, colour: Any) -> None:
-    """Fill a polygon whose corners are given in metres."""
+    """Fill a polygon with corners in metres."""
     corners = np.round(np.asarray(points, np.float64) * scale).astype(np.int32)
     cv2.fillPoly(image, [corners], tuple(float(c) for c in np.atleast_1d(colour)))
 

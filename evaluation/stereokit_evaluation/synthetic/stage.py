@@ -129,7 +129,7 @@ class Stage:
         clear : float
             Share of the light behind it that it lets through.
         plain : bool
-            Without texture; drawn from the stage's share if it is not given.
+            Without texture; by default drawn from the stage's share.
         turned : bool
             Lay the texture at any angle.
         """

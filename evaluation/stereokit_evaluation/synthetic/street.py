@@ -143,7 +143,7 @@ class _Street:
         self.patches.append(Patch(place, along, (0, 1, 0), wide, tall, look))
 
     def _facade_decals(self, width: float, height: float) -> tuple[Decal, ...]:
-        """Return what is hard to match on a house: empty plaster or a changed brightness."""
+        """Return a hard case for matching on a house: empty plaster or a changed brightness."""
         rng = self.rng
         if not self.hard:
             return ()

@@ -98,19 +98,19 @@ def terrain(stage: Stage) -> None:
             w, d = pitch * rng.uniform(0.12, 0.6, 2)
             h = tall * float(np.exp(rng.normal(0, 0.5)))
             place = turn @ np.array([cell[0], 0, cell[1]])
-            at = place + np.array([0, -ground(place[0], place[2]), 0])
+            position = place + np.array([0, -ground(place[0], place[2]), 0])
             own = turn @ rotation(float(rng.normal(0, 0.04)))
-            stage.add(box(w, h * 2, d), walls[int(rng.integers(4))], None, own, at)
+            stage.add(box(w, h * 2, d), walls[int(rng.integers(4))], None, own, position)
             roof = roofs[int(rng.integers(8))]
             if rng.random() < 0.5:
                 points, uv = _roof(w * 1.08, d * 1.08, w * rng.uniform(0.15, 0.5))
-                stage.add(grid(points, uv), roof, None, own, at + np.array([0, -h, 0]))
+                stage.add(grid(points, uv), roof, None, own, position + np.array([0, -h, 0]))
             else:
-                stage.add(box(w * 0.99, 0.1, d * 0.99), roof, None, own, at + np.array([0, -h - 0.02, 0]))
+                stage.add(box(w * 0.99, 0.1, d * 0.99), roof, None, own, position + np.array([0, -h - 0.02, 0]))
                 for _ in range(int(rng.integers(0, 4))):
                     part = rng.uniform(0.05, 0.2, 3) * min(w, d)
                     spot = own @ np.array([rng.uniform(-0.4, 0.4) * w, -h, rng.uniform(-0.4, 0.4) * d])
-                    stage.add(box(*part), roofs[int(rng.integers(8))], None, own, at + spot)
+                    stage.add(box(*part), roofs[int(rng.integers(8))], None, own, position + spot)
     leaves = stage.paint(str(rng.choice(["fractal", "speckle"])), 3.0, float(rng.uniform(0.08, 0.3)), 0.2, plain=False)
     woods = rng.uniform(-60, 60, (int(rng.integers(1, 7)), 2))
     crowns = []
@@ -121,10 +121,10 @@ def terrain(stage: Stage) -> None:
             else woods[int(rng.integers(len(woods)))] + rng.normal(0, 8, 2)
         )
         radius = float(rng.uniform(0.7, 2.4))
-        at = np.array([at2[0], -ground(at2[0], at2[1]) - radius * 0.7, at2[1]])
+        position = np.array([at2[0], -ground(at2[0], at2[1]) - radius * 0.7, at2[1]])
         crowns.append(
             blob(radius, rng.uniform(-0.15, 0.15, (9, 17)), steps=8).moved(
-                rotation(float(rng.uniform(0, 6))), tuple(at)
+                rotation(float(rng.uniform(0, 6))), tuple(position)
             )
         )
     if crowns:

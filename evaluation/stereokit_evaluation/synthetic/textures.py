@@ -162,7 +162,7 @@ class Decal:
 
 @dataclass(frozen=True)
 class Look:
-    """What a patch is painted with.
+    """The appearance of a patch.
 
     Attributes
     ----------

@@ -199,7 +199,7 @@ def test_workers_are_waited_for_after_an_interrupt():
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_steady_stream_of_frames_allocates_nothing_but_the_maps_it_returns(method, threads):
+def test_a_steady_stream_of_frames_allocates_a_few_maps_and_no_costs(method, threads):
     pair = pair_of(9, (90, 200))
     matcher = Matcher(method, max_disparity=32, threads=threads)
     for _ in range(2):
@@ -213,7 +213,8 @@ def test_a_steady_stream_of_frames_allocates_nothing_but_the_maps_it_returns(met
             result = matcher(*pair)
             _, peak = tracemalloc.get_traced_memory()
             returned = result.disparity.nbytes + result.valid.nbytes
-            assert peak - before - returned < 32_000  # objects of python: no map, and less than two rows of levels
+            # masks and maps of the looks at the pair, a few at a time, and nothing that grows with the levels
+            assert peak - before - returned < 30 * pair[0].size
             results.append(result)
     finally:
         tracemalloc.stop()

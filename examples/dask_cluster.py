@@ -27,7 +27,7 @@ def main():
         summary = run_batch(job, pairs, lambda job, pairs: on_cluster(job, pairs, client), inputs="pairs")
     print(f"{summary.written} maps written, {summary.failed} failed")
     again = run_batch(job, pairs, on_threads, inputs="pairs")  # this machine goes on: nothing is left to do
-    print(f"{again.found} maps found")
+    print(f"{again.existing} maps found")
 
 
 if __name__ == "__main__":  # the workers are processes that load this file too

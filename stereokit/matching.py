@@ -102,7 +102,7 @@ class Matcher:
             raise OptionError(f"device must be 'auto', 'cpu' or 'cuda', got {shown(device)}")
         if device == "cuda":
             require_device()
-        self.threads = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
+        count = available_threads() if threads is None else check_integer("threads", threads, 1, 1024)
         settings = MatchSettings.parse(
             method,
             max_disparity=max_disparity,
@@ -111,8 +111,7 @@ class Matcher:
             refiner=refiner,
             options={**options},
         )
-        self._pipeline: Pipeline = _pipeline(settings, device)
-        self._watch = PairWatch()
+        self._begin(_pipeline(settings, device), count)
 
     @property
     def settings(self) -> MatchSettings:
@@ -151,12 +150,12 @@ class Matcher:
 
     @property
     def refiner(self) -> str | None:
-        """The refiner's name, or the path of its weights; None at full size."""
+        """The refiner's name, or the path of its weights; None where no refiner runs."""
         return self.settings.refiner_name
 
     @property
     def refine(self) -> Callable[..., Disparity] | None:
-        """The refiner itself (`stereokit_refiners.contract.Refiner`); None at full size."""
+        """The refiner itself (`stereokit_refiners.contract.Refiner`); None where no refiner runs."""
         return self.settings.refiner
 
     @property
@@ -174,9 +173,14 @@ class Matcher:
     def replaced(self, **changes: Any) -> Matcher:
         """Return a matcher that differs in some of its `settings`, by their names."""
         matcher = Matcher.__new__(Matcher)
-        matcher.threads = self.threads
-        matcher._pipeline = self._pipeline.replaced(**changes)
+        matcher._begin(self._pipeline.replaced(**changes), self.threads)
         return matcher
+
+    def _begin(self, pipeline: Pipeline, threads: int) -> None:
+        """Set what every matcher has, however it is made."""
+        self._pipeline = pipeline
+        self.threads = threads
+        self._watch = PairWatch()
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
         """Return the bytes of the buffers for a pair; see `stereokit.pipeline.Pipeline`."""
@@ -186,11 +190,9 @@ class Matcher:
         return {"settings": self.settings, "threads": self.threads, "device": self.device}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.threads = state["threads"]
         if state["device"] == "cuda":
             require_device()
-        self._pipeline = _pipeline(state["settings"], state["device"])
-        self._watch = PairWatch()
+        self._begin(_pipeline(state["settings"], state["device"]), state["threads"])
 
     def __repr__(self) -> str:
         levels = f"min_disparity={self.min_disparity}, max_disparity={self.max_disparity}"

@@ -15,16 +15,16 @@ What has no counterpart is kept for its getter, and named in one warning. See do
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import InputError, OptionError, StereokitWarning
+from stereokit.errors import InputError, OptionError
 from stereokit.images.check import check_integer
 from stereokit.matching import Matcher
+from stereokit.notices import warn
 
 __all__ = [
     "STEREO_SGBM_MODE_HH",
@@ -240,11 +240,9 @@ class StereoSGBM:
 def _warn_of(names: list[str]) -> None:
     if names:
         many = len(names) > 1
-        warnings.warn(
+        warn(
             f"{', '.join(names)} {'have' if many else 'has'} no counterpart in stereokit and {'are' if many else 'is'} "
-            "not used; see docs/opencv.md",
-            StereokitWarning,
-            stacklevel=4,
+            "not used; see docs/opencv.md"
         )
 
 

@@ -131,7 +131,7 @@ def test_the_commands_of_a_page_run_or_parse(page, folder, run_python):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_commands_within_the_text_of_a_page_parse(page):
-    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    text = re.sub(r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     for command in re.findall(r"`(stereokit [^`]+)`", text):
         words = command.split()
         if len(words) > 2:

@@ -8,13 +8,13 @@ general one is better, and so it is for crops of a street down to 16x32 pixels (
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from numpy.typing import NDArray
 
-from stereokit.errors import OptionError, StereokitError, StereokitWarning
+from stereokit.errors import OptionError, StereokitError
+from stereokit.notices import warn
 from stereokit.result import Disparity
 from stereokit_refiners.learned import EvidenceRefiner
 from stereokit_refiners.linear import Linear
@@ -57,7 +57,7 @@ class AutoRefiner:
         except OptionError:
             raise
         except StereokitError as error:
-            warnings.warn(f"refiner 'auto' is linear: {error}", StereokitWarning, stacklevel=2)
+            warn(f"refiner 'auto' is linear: {error}")
             general = None
         object.__setattr__(self, "general", general)
 

@@ -23,7 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import DeviceError, OptionError, StereokitError, StereokitWarning
+from stereokit.errors import DeviceError, OptionError, StereokitError
+from stereokit.notices import warn
 from stereokit.postprocess import fill
 from stereokit.registry import REFINERS
 from stereokit.result import Disparity
@@ -266,12 +267,10 @@ class LearnedRefiner:
         if share > _FEW and not self._compiled.warned:
             self._compiled.warned = True
             lowered = f", {2 * shift:g} px taken off" if shift > 0 else ""
-            warnings.warn(
+            warn(
                 f"refiner {self._file.network!r} was trained on disparities from {low:g} to {high:g} px, "
                 f"{100 * share:.0f} % of this map lie beyond{lowered}: they come out 1 to 2 % too small; "
-                "refiner 'linear' takes any",
-                StereokitWarning,
-                stacklevel=3,
+                "refiner 'linear' takes any"
             )
 
     def _weighed(
@@ -390,7 +389,7 @@ def _precision(name: str, backend: str, content: WeightFile) -> str:
     from llvmlite import binding
 
     features = binding.get_host_cpu_features()
-    if content.ranges and (features.get("avx512vnni") or features.get("avxvnni")):
+    if content.ranges and features.get("avx2"):  # with VNNI or without, faster than fp32
         return "int8"
     return "bf16" if features.get("avx512bf16") or features.get("amx-bf16") else "fp32"
 

@@ -70,9 +70,20 @@ def _upscaled_by(
     """Return `gain` times an image at `step` times its size, bilinearly, cut to a size: a copy, or as `upscaled`."""
     if step == 2:
         return upscaled(image, gain, rows, columns, threads)
-    size = (step * image.shape[1], step * image.shape[0])
-    large = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)).reshape(size[1], size[0])
-    return np.asarray(large[:rows, :columns] * np.float32(gain), np.float32)
+    image = np.ascontiguousarray(image, np.float32)
+    if step == 4:
+        image = _fourfold(_fourfold(image.T * np.float32(gain)).T)
+    return np.array(image[:rows, :columns]) if step == 4 else image[:rows, :columns] * np.float32(gain)
+
+
+def _fourfold(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return an image at four times its width, bilinearly: its pixel and the next one in eighths, each sum rounded."""
+    height, width = image.shape
+    before, after = (image[:, np.clip(np.arange(width) + side, 0, width - 1)] for side in (-1, 1))
+    out = np.empty((height, width, 4), np.float32)
+    for phase, (share, other) in enumerate(((5, before), (7, before), (7, after), (5, after))):
+        out[:, :, phase] = image * np.float32(share / 8) + other * np.float32(1 - share / 8)
+    return out.reshape(height, 4 * width)
 
 
 def upscaled(image: NDArray[np.float32], gain: float, rows: int, columns: int, threads: int = 1) -> NDArray[np.float32]:

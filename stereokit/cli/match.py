@@ -38,7 +38,7 @@ from stereokit.cli.pair import (
     read_mask,
     strictly,
 )
-from stereokit.cli.rig import AlphaOption, RigOption, read_rig_option
+from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, read_rig_option, rig_files
 from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
 
 if TYPE_CHECKING:
@@ -129,15 +129,16 @@ def match(
             check_fits_png(name, min_disparity, max_disparity)
     outputs.update(check_json(json_file))
     inputs = {"--calibration": calibration, "--mask": mask, "--right-mask": right_mask}
+    if rig is not None:
+        inputs.update(
+            {f"--rig {part}": Path(file) for part, file in zip(("LEFT", "RIGHT"), rig_files(rig), strict=False)}
+        )
     _check_distinct({"LEFT": left, "RIGHT": right_image, **inputs}, outputs)
     if layout is not None and right_image is not None:
         raise OptionError("--layout is for one file with both views, got LEFT and RIGHT")
-    if rig is not None and calibration is not None:
-        raise OptionError("--rig and --calibration exclude each other: rectification gives the calibration")
+    check_rig_options(rig, alpha, calibration)
     if rig is None and (ply is None and depth is None) != (calibration is None):
         raise OptionError("--ply and --depth go together with --calibration, got only one of them")
-    if alpha is not None and rig is None:
-        raise OptionError("--alpha is for --rig")
     _check_metres(frame, max_depth, calibration_scale)
     options = parse_settings(settings or [])
     flags = {
@@ -162,17 +163,17 @@ def match(
                 raise OptionError(f"{name} is not available with --memory and --overlap")
         if rig is not None:
             raise OptionError("--rig is not available with --memory and --overlap; stereokit rectify comes before them")
-        if align:
-            raise OptionError("--align is not available with --memory and --overlap")
+        for name, wanted in (("--align", align), ("--strict", strict)):
+            if wanted:
+                raise OptionError(f"{name} is not available with --memory and --overlap")
         if right_image is None:
             raise OptionError("RIGHT must be given with --memory and --overlap: one file with both views is read whole")
         from stereokit.cli.match_large import match_in_windows
 
         mask_files = {"mask": mask, "right_mask": right_mask}
-        with strictly(strict):
-            content, table = match_in_windows(
-                left, right_image, output, method, memory, overlap, {**matcher_options, **options, **mask_files}
-            )
+        content, table = match_in_windows(
+            left, right_image, output, method, memory, overlap, {**matcher_options, **options, **mask_files}
+        )
         report({**content, "options": options, "version": version_of("stereokit")}, [table], json_file)
         return
 

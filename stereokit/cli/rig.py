@@ -15,7 +15,7 @@ from stereokit.errors import OptionError
 if TYPE_CHECKING:
     from stereokit.rig import StereoRig
 
-__all__ = ["AlphaOption", "RigOption", "parse_size", "read_rig_option", "rig", "rig_files"]
+__all__ = ["AlphaOption", "RigOption", "check_rig_options", "parse_size", "read_rig_option", "rig", "rig_files"]
 
 RigOption = Annotated[
     str | None,
@@ -54,6 +54,20 @@ def read_rig_option(text: str, size: tuple[int, int] | None = None) -> StereoRig
 
     paths = rig_files(text)
     return read_rig(paths[0], paths[1] if len(paths) == 2 else None, size=size)
+
+
+def check_rig_options(rig: str | None, alpha: float | None, calibration: Path | None = None) -> None:
+    """Refuse options that do not go with ``--rig``, or without it.
+
+    Raises
+    ------
+    OptionError
+        If ``--calibration`` comes with ``--rig``, or ``--alpha`` without.
+    """
+    if rig is not None and calibration is not None:
+        raise OptionError(f"--calibration must not come with --rig, which gives the calibration, got {rig!r}")
+    if alpha is not None and rig is None:
+        raise OptionError(f"--alpha must come with --rig, got {alpha:g} alone")
 
 
 def parse_size(name: str, text: str | None) -> tuple[int, int] | None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import FileError, StereokitError, one_line
+from stereokit.errors import FileError, StereokitError, StereokitWarning, one_line
 
 __all__ = ["parsing", "read_bytes", "read_json", "read_npy", "read_text"]
 
@@ -28,8 +28,8 @@ _LONGEST_REASON = 200
 def parsing(path: str | os.PathLike[str], kind: str, rule: str | None = None) -> Iterator[None]:
     """Turn every exception of a ``with`` block into a `FileError` that names the file.
 
-    An interrupt passes, and so do a `FileError` and a warning. A lack of memory counts as a fault of the file, whose
-    header states its size.
+    An interrupt passes, and so do a `FileError` and a warning of ours. A lack of memory counts as a fault of the file,
+    whose header states its size.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def parsing(path: str | os.PathLike[str], kind: str, rule: str | None = None) ->
     name = repr(str(path))
     try:
         yield
-    except (FileError, Warning):  # a warning is one where the filters of `warnings` say so
+    except (FileError, StereokitWarning):  # a warning of ours is raised where the filters of `warnings` say so
         raise
     except StereokitError as error:  # a rule of ours that the content breaks
         raise FileError(f"{name}: {error}") from error

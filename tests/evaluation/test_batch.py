@@ -122,7 +122,7 @@ def test_what_is_no_input_is_refused(tmp_path):
     assert "nor a video" in refused(tmp_path / "a.mp4", *out)
     (tmp_path / "a.png").write_text("no image")
     for images_given in ([tmp_path / "a.png"], [tmp_path / "a.png", tmp_path / "a.png"]):
-        assert "folders, lists or videos, got the image" in refused(*images_given, *out)
+        assert "folders, lists, videos or bags, got the image" in refused(*images_given, *out)
     assert "two folders or two videos" in refused(tmp_path / "empty", tmp_path / "a.mp4", *out)
     assert "one or two" in refused(tmp_path, tmp_path, tmp_path, *out)
     write_pairs(tmp_path / "twice", ["a"])
@@ -233,7 +233,7 @@ def test_bad_options_are_refused_before_anything_is_made(tmp_path):
         (("--engine", "dask"), "go together"),
         (("--scheduler", "tcp://x:1"), "go together"),
         (("--workers", "0"), "workers must be"),
-        (("--refiner", "stereovae"), "needs scale=0.5"),
+        (("--refiner", "stereovae"), "needs weights: 'kitti'"),
     ):
         assert line in refused(tmp_path, *out, *words)
     assert not (tmp_path / "out").exists()

@@ -417,7 +417,7 @@ def test_a_hostile_frame_costs_itself_and_any_name_can_be_shown(tmp_path, fake):
     (tmp_path / "disparity" / "header.tif").write_bytes(b"II*\0\x08\0\0\0")
     write_disparity(tmp_path / "disparity" / "size.pfm", np.full((3, 3), 10, np.float32))
     done = command("--dataset", "folder", "--root", tmp_path, "--json", tmp_path / "out.json")
-    assert done.exit_code == 1, done.output
+    assert done.exit_code == 1 and isinstance(done.exception, SystemExit), f"{done.output}{done.exception!r}"
     document = read(tmp_path / "out.json")
     assert document["results"][0]["images"] == 1
     assert sorted(skip["frame"] for skip in document["skipped"]) == sorted(set(names) - {"good"})
@@ -438,4 +438,8 @@ def test_what_looks_wrong_about_a_frame_is_told(tmp_path):
     done = command("--dataset", "folder", "--root", tmp_path, "--method", "S2", "--max-disparity", "128")
     assert done.exit_code == 0, done.output
     lines = [line for line in done.output.splitlines() if line.startswith("warning: ")]
-    assert len(lines) == 2 and "rows: only " in lines[0] and "same: left and right hold the same pixels" in lines[1]
+    assert (
+        len(lines) == 2
+        and "rows: rows do not meet: the right view lies 9.0 px lower" in lines[0]
+        and "same: left and right hold the same pixels" in lines[1]
+    )

@@ -85,8 +85,8 @@ def test_match_rectifies_first(scene, tmp_path):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (("--rig", "{}/rig.yml", "--calibration", "{}/rig.yml"), "--rig and --calibration exclude each other"),
-        (("--alpha", "1"), "--alpha is for --rig"),
+        (("--rig", "{}/rig.yml", "--calibration", "{}/rig.yml"), "--calibration must not come with --rig"),
+        (("--alpha", "1"), "--alpha must come with --rig"),
         (("--rig", "{}/none.yml"), "no such file"),
         (("--rig", "a,b,c"), "--rig must be a file, a folder or LEFT,RIGHT, got 'a,b,c'"),
         (("--rig", "{}/rig.yml", "--memory", "1GB"), "--rig is not available with --memory"),
@@ -219,7 +219,7 @@ def test_view_rectifies_first(scene, tmp_path):
     )
     assert "no calibration" not in output and (tmp_path / "v.html").stat().st_size > 10_000
     line = run("view", *raw, "-o", tmp_path / "v.html", "--alpha", 1, status=2)
-    assert "--alpha is for --rig" in line
+    assert "--alpha must come with --rig" in line
 
 
 def test_rig_shows_and_rewrites(scene, tmp_path):

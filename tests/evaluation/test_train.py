@@ -444,7 +444,7 @@ def test_a_run_that_was_killed_twice_ends_with_the_weights_of_one_that_was_not(r
 
 
 BAD = [
-    ([], ["dataset", "streets must be set"]),
+    ([], ["dataset, extra, streets or generated must be set"]),
     (["--dataset", "folder"], ["root must name the folder", "'folder'"]),
     (["--dataset", "kitty2015", "--root", "."], ["no data set named 'kitty2015'", "kitti2015"]),
     (["--dataset", "folder", "--root", "nowhere"], ["root must be a folder", "nowhere"]),
@@ -475,7 +475,7 @@ BAD = [
     (["DATA", "--set", "betas=0.9"], ["betas"]),
     (["DATA", "--set", "ema=2"], ["ema"]),
     (["DATA", "--set", "seed=-1"], ["seed"]),
-    (["DATA", "--set", "output_mode=printed"], ["form must be one of"]),
+    (["DATA", "--set", "output_mode=printed"], ["output_mode must be one of"]),
     (["DATA", "--set", "rows=12"], ["multiples of 8"]),
     (["DATA", "--refiner", "pyramid", "--set", "output_mode=direct"], ["direct"]),
     (["DATA", "--json", "nowhere/r.json"], ["--json"]),

@@ -262,7 +262,7 @@ def test_fingerprints_say_what_the_result_depends_on(tmp_path):
 def test_backends_are_checked(tmp_path):
     path = weight_file(tmp_path, "cnn")
     with pytest.raises(
-        OptionError, match=r"^backend must be one of auto, openvino, onnxruntime, torch, got 'tensorrt'$"
+        OptionError, match=r"^backend must be one of auto, openvino, onnxruntime, torch, opencv, got 'tensorrt'$"
     ) as caught:
         LearnedRefiner(path, backend="tensorrt")
     one_line(caught.value)

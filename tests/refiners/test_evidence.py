@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from refining import weight_file
 
 import stereokit
 from stereokit.errors import OptionError
@@ -357,9 +358,10 @@ def test_what_does_not_fit_is_refused(change, message):
         _refiner()(coarse, left, **{"right": right, **change})
 
 
-def test_other_networks_refuse_other_scales():
+def test_other_networks_refuse_other_scales(tmp_path):
+    weights = weight_file(tmp_path, "stereovae")
     with pytest.raises(OptionError, match=r"refiner 'stereovae' needs scale=0.5, got scale=0.25"):
-        stereokit.Matcher("S2", scale=0.25, refiner="stereovae", device="cpu")
+        stereokit.Matcher("S2", scale=0.25, refiner="stereovae", weights=weights, device="cpu")
 
 
 def _scene():
@@ -387,6 +389,28 @@ def test_shipped_weights_sharpen_edges_and_keep_what_is_right(scale):
     if scale < 1:
         assert wrong[1] < 0.7 * wrong[0]
     assert abs(float(np.median(general - truth))) < (0.05 if scale > 0.25 else 0.15)
+
+
+def _plane(first, slope):
+    """Return both views of a textured plane whose disparities are ``first + slope * x``, and these."""
+    rng = np.random.default_rng(15)
+    rows, columns, margin = 96, 320, 120
+    noise = rng.integers(0, 256, (rows, columns + 2 * margin)).astype(np.float32)
+    texture = np.clip((cv2.GaussianBlur(noise, (0, 0), 1.3) - 128) * 3 + 128, 0, 255)
+    y, x = np.indices((rows, columns), np.float32)
+    truth = np.float32(first) + np.float32(slope) * x
+    left = cv2.remap(texture, x - truth + margin, y, cv2.INTER_CUBIC)
+    pair = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in (left, texture[:, margin : margin + columns]))
+    return *pair, truth
+
+
+@pytest.mark.parametrize(("first", "slope"), [(2.3, 0), (7.6, 0), (20.25, 0.02), (60.7, -0.1)])
+@pytest.mark.parametrize(("scale", "most"), [(1, 0.05), (0.5, 0.05), (0.25, 0.09)])
+def test_shipped_weights_have_no_bias_on_planes(scale, most, first, slope):
+    left, right, truth = _plane(first, slope)
+    found = stereokit.match(left, right, "S2", max_disparity=96, scale=scale, refiner="general", device="cpu")
+    seen = np.arange(truth.shape[1]) >= truth
+    assert abs(float(np.median((found - truth)[seen]))) < most
 
 
 def test_shipped_weights_follow_an_offset_of_all_disparities():

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS  # noqa: E402
-from stereokit_refiners.runtimes.evidence import hypotheses  # noqa: E402
+from stereokit_refiners.runtimes.evidence import hypotheses, network_input  # noqa: E402
 from stereokit_refiners.runtimes.mixture import mixture as compiled_mixture  # noqa: E402
 from stereokit_refiners.training import evidence as training  # noqa: E402
 from stereokit_refiners.weights import read  # noqa: E402
@@ -46,11 +46,10 @@ def test_what_is_packed_comes_back():
         rng.integers(0, 100, (channels, 3, 5)).astype(dtype)
         for name, (channels, dtype) in training._FIELDS.items()
     }  # fmt: skip
-    fields["input"] = rng.integers(-100, 100, (sum(CHANNELS.values()), 3, 5)) / training._INPUT_STEPS
+    fields["input"] = rng.integers(-127, 128, (sum(CHANNELS.values()), 3, 5)).astype(np.int8)
     unpacked = training.unpacked(training.packed(fields))
     for name, array in fields.items():
-        expected = np.rint(array * training._INPUT_STEPS) if name == "input" else array
-        np.testing.assert_array_equal(unpacked[name], expected.transpose(1, 2, 0))
+        np.testing.assert_array_equal(unpacked[name], array.transpose(1, 2, 0))
 
 
 @pytest.mark.parametrize("step", [1, 2, 4])
@@ -64,21 +63,18 @@ def test_the_mixture_of_stored_samples_is_that_of_the_kernels(step):
     head = head.astype(np.float32)
     expected = compiled_mixture(head, fields, *left.shape)[0]
 
-    half = np.mean([fields.coarse[i::2, j::2] for i in (0, 1) for j in (0, 1)], axis=0)
-
     def folded(plane, side):
         return training._folded(plane, side)
 
-    inputs = [
-        np.concatenate([folded(values - half, 2) for values in fields.others]),
-        folded(fields.coarse - half.repeat(2, 0).repeat(2, 1), 4), training._gains(fields.around),
-    ]  # fmt: skip
-    tensors = [torch.from_numpy(part.astype(np.float32))[None] for part in (head.transpose(2, 0, 1), *inputs)]
-    apart = torch.tensor([float(fields.apart)])
-    less = training.mixture(*tensors, apart)[0].numpy()
-    height, width = fields.coarse.shape
-    full = less.reshape(4, 4, height // 4, width // 4).transpose(2, 0, 3, 1).reshape(height, width)
-    full = (full + fields.coarse + fields.base)[: left.shape[0], : left.shape[1]]
+    near = np.concatenate([folded(values - fields.half, 2) for values in fields.others])
+    within = folded(fields.coarse - fields.half.repeat(2, 0).repeat(2, 1), 4)
+    inputs = network_input(fields, rng.random(size).astype(np.float32), left, left.shape[1]).transpose(1, 2, 0)
+    means = training.gains_around(inputs[None])[0].transpose(2, 0, 1)
+    tensors = [
+        torch.from_numpy(part.astype(np.float32))[None] for part in (head.transpose(2, 0, 1), means, near, within)
+    ]
+    full = training.mixture(*tensors, torch.tensor([float(fields.apart)]))[0].numpy()
+    full = (full + fields.half.repeat(2, 0).repeat(2, 1) + fields.base)[: left.shape[0], : left.shape[1]]
     np.testing.assert_allclose(full, expected, atol=1e-3)
 
 
@@ -91,10 +87,12 @@ def test_samples_say_what_is_missing_and_who_sees_it():
 
 
 def test_the_identity_costs_what_the_coarse_map_costs_and_harm_costs_more():
-    fields = {name: torch.from_numpy(a[None]).permute(0, 3, 1, 2) for name, a in _fields()[0].items()}
+    stored = {name: a[None] for name, a in _fields()[0].items()}
+    stored["means"] = training.gains_around(stored["input"])
+    fields = {name: torch.from_numpy(a).permute(0, 3, 1, 2) for name, a in stored.items()}
     head = torch.zeros(1, LOGITS + GAINS + 4, *fields["miss"].shape[2:])
     head[:, :LOGITS] = -40
-    sure = 0.05 * np.log(2)  # of logits of 0, whatever is right
+    sure = 0.2 * np.log(2)  # of logits of 0, whatever is right
     value, before = training.loss(head, fields, torch.ones(1))
     assert float(value.detach()) == pytest.approx(float(before) + sure, rel=1e-4)
     head[:, :4] = 40  # always a pixel less
@@ -118,6 +116,9 @@ def test_a_short_run_learns_goes_on_and_gives_weights_that_are_read(tmp_path, mo
     line = capsys.readouterr().out.splitlines()[-1]
     assert line.startswith("20 loss ")
     content = training.fit(samples, output, steps=22, batch=2, size=(16, 32))  # goes on from the checkpoint
+    other = training.fit(samples, tmp_path / "other.safetensors", steps=0, batch=2, size=(16, 32), start=output)
+    for name, array in content.arrays.items():  # a file is for bytes, training for units
+        np.testing.assert_allclose(other.arrays[name], array, rtol=1e-5)
     assert content.notes["steps"] == 22
     assert read(output).fingerprint == content.fingerprint
-    assert set(content.ranges) > {"stem", "merge_0"}
+    assert set(content.ranges) > {"stem", "merge_1"}

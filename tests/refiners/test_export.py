@@ -98,7 +98,7 @@ def test_the_report(tmp_path):
     assert result.exit_code == 0, result.output
     assert str(out) in result.output.replace("\n", "")
     document = json.loads(report.read_text())
-    assert set(document) == {"output", "format", "network", "form", "weights", "largest_difference_px"}
+    assert set(document) == {"output", "format", "network", "output_mode", "weights", "largest_difference_px"}
     assert (document["network"], document["output_mode"], document["format"]) == ("cnn", "residual", "onnx")
     assert document["weights"] == random_content("cnn").fingerprint
     assert 0 <= document["largest_difference_px"] <= module.TOLERANCE_PX

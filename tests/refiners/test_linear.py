@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import oracles
 import pytest
@@ -70,6 +72,25 @@ def test_bits_are_those_of_loops_whatever_the_threads(size, threads):
     fine = Linear()(coarse, np.zeros(size, np.uint8), threads=threads)
     expected = upscaled_by_loops(coarse.disparity, *size)
     np.testing.assert_array_equal(fine.disparity, expected)
+
+
+@pytest.mark.parametrize("size", [*SIZES, (23, 150)])
+def test_bits_at_a_quarter_of_the_size_are_those_of_loops(size):
+    """Down the columns first; each sum of two products is rounded as single precision rounds it."""
+    height, width = size
+    shape = -(-height // 4), -(-width // 4)
+    image = (np.random.default_rng(6).random(shape) * 40).astype(np.float32)
+    image[np.random.default_rng(7).random(shape) < 0.05] = NAN
+    fine = Linear()(Disparity(image, ~np.isnan(image)), np.zeros(size, np.uint8), scale=0.25)
+
+    def mixed(line, x):
+        share = np.float32((7 if x % 4 in (1, 2) else 5) / 8)
+        beside = min(max(x // 4 + (1 if x % 4 > 1 else -1), 0), len(line) - 1)
+        return line[x // 4] * share + line[beside] * (np.float32(1) - share)
+
+    for y, x in itertools.islice(np.ndindex(size), 0, None, 1 if height * width < 200 else 7):
+        column = [mixed(np.float32(4) * image[:, k], y) for k in range(shape[1])]
+        np.testing.assert_array_equal(fine.disparity[y, x], mixed(column, x))
 
 
 @pytest.mark.parametrize("size", [*SIZES, (23, 150)])

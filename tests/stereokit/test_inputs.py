@@ -294,7 +294,7 @@ BAD_OPTIONS = [
     ({"threads": 0}, ["threads", "from 1", "0"]),
     ({"threads": -1}, ["threads", "-1"]),
     ({"threads": 1.5}, ["threads", "1.5"]),
-    ({"refiner": "cnn"}, ["refiner", "scale=0.5"]),
+    ({"refiner": "cnn"}, ["refiner 'cnn' needs weights"]),
     ({"refiner": "liner", "scale": 0.5}, ["refiner", "liner", "did you mean 'linear'"]),
     ({"refiner": 3, "scale": 0.5}, ["refiner", "3"]),
     ({"fill": "foreground"}, ["fill", "foreground", "background"]),

@@ -40,7 +40,7 @@ from stereokit.cli.options import (
 )
 from stereokit.cli.output import Table
 from stereokit.cli.pair import AlignOption, MaskOption, NodataOption, RightMaskOption, StrictOption
-from stereokit.cli.rig import AlphaOption, RigOption, rig_files
+from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, rig_files
 from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, LAYOUTS, READABLE_SUFFIXES, read_disparity, read_image
@@ -120,8 +120,7 @@ def batch(
     if weights is not None and weights.endswith(".safetensors"):
         options["weights"] = os.path.abspath(weights)
     folder = os.path.abspath(output)
-    if alpha is not None and rig is None:
-        raise OptionError("--alpha is for --rig")
+    check_rig_options(rig, alpha)
     raw = () if rig is None else tuple(os.path.abspath(path) for path in rig_files(rig))
     left_mask, other_mask = (None if path is None else os.path.abspath(path) for path in (mask, right_mask))
     for path in (mask, right_mask):

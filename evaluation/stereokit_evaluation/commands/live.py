@@ -19,11 +19,10 @@ from stereokit.cli.options import (
     SettingsOption,
     parse_settings,
 )
-from stereokit.cli.rig import AlphaOption, RigOption, read_rig_option, rig_files
-from stereokit.errors import OptionError
+from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, read_rig_option, rig_files
+from stereokit.errors import OptionError, StereokitError
 from stereokit.rig import Rectification
 from stereokit_evaluation.live.engine import Engine
-from stereokit_evaluation.live.server import serve
 from stereokit_evaluation.live.source import open_source
 
 __all__ = ["live"]
@@ -58,12 +57,13 @@ def live(
     One SOURCE holds both views side by side (or is a folder of pairs); two are left and right. With --rig they are raw
     ones, and are rectified first. The page is for this machine only.
     """
+    try:
+        from stereokit_evaluation.live.server import serve
+    except ModuleNotFoundError as error:
+        raise StereokitError('live needs aiohttp: pip install "stereokit[live]"') from error
     if not 0 <= port <= 65535:
         raise OptionError(f"--port must be from 0 to 65535, got {port}")
-    if rig is not None and calibration is not None:
-        raise OptionError("--rig and --calibration exclude each other: rectification gives the calibration")
-    if alpha is not None and rig is None:
-        raise OptionError("--alpha is for --rig")
+    check_rig_options(rig, alpha, calibration)
     if rig is not None:
         rig_files(rig)  # refuses what is not there
 

@@ -23,7 +23,7 @@ from stereokit.cli.options import (
     parse_settings,
     write_json,
 )
-from stereokit.cli.rig import AlphaOption, RigOption, read_rig_option
+from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, read_rig_option
 from stereokit.errors import InputError, OptionError
 from stereokit.io import check_output, read_disparity, read_pair, write_bytes
 from stereokit_evaluation.common.weights import check_weights, weights_option
@@ -70,10 +70,7 @@ def view(
     require("jinja2")
     if refiner and scale == 1:
         raise OptionError(f"refiner needs --scale 0.5, got {', '.join(refiner)} with scale 1")
-    if rig is not None and calibration is not None:
-        raise OptionError("--rig and --calibration exclude each other: rectification gives the calibration")
-    if alpha is not None and rig is None:
-        raise OptionError("--alpha is for --rig")
+    check_rig_options(rig, alpha, calibration)
     options: dict[str, Any] = {"max_disparity": max_disparity, "min_disparity": min_disparity, "scale": scale}
     options |= {"threads": threads, "device": device, **parse_settings(settings or ())}
     names = list(dict.fromkeys(method or ["S2"]))

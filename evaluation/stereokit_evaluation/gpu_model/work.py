@@ -148,7 +148,7 @@ def _sgm_final(a: SimpleNamespace, blocks: int, numbers: tuple[int, ...]) -> Wor
     padded, others = numbers[0], numbers[1] - 1
     lanes, loads = _loads(padded)
     requested = blocks * (128 // lanes) * (a.height + 1)
-    reads = {"costs": padded * requested, "guide": lanes * requested, "stored": others * padded * requested}
+    reads = {"costs": padded * requested, "guide": lanes * requested, "path_costs": others * padded * requested}
     writes = {"disparity": 4 * a.height * a.width, "cost": 2 * a.height * a.width}
     return Work(reads, writes, a.height, loads * (1 + others) + 4, ahead=True)
 

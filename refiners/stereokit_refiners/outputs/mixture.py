@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.jit import kernel
 from stereokit.kernels.threads import run, spans
 from stereokit_refiners.outputs.contract import GAIN
+from stereokit_refiners.outputs.exponential import exponential
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -139,25 +140,6 @@ def _correct(
             out[y, x] = coarse[y, x] + _GAIN * head[y, x, 0]
 
 
-@inline
-def _exponential(x: Any) -> Any:
-    """Return p and n with ``p * 2**n = e**x`` to about 1e-7, for x from -80 to 0: p is a polynomial.
-
-    Single IEEE operations, so that it becomes vector code and is the same everywhere.
-    """
-    x = max(x, np.float32(-80)) * np.float32(1.4426950408889634)
-    whole = np.floor(x + np.float32(0.5))
-    z = (x - whole) * np.float32(0.6931471805599453)
-    p = np.float32(1 / 720)
-    p = p * z + np.float32(1 / 120)
-    p = p * z + np.float32(1 / 24)
-    p = p * z + np.float32(1 / 6)
-    p = p * z + np.float32(0.5)
-    p = p * z + np.float32(1)
-    p = p * z + np.float32(1)
-    return p, np.int32(whole)
-
-
 @kernel
 def _mix(
     head: NDArray[np.float32], corrected: NDArray[np.float32], candidates: NDArray[np.float32],
@@ -168,7 +150,6 @@ def _mix(
     height, width = corrected.shape
     around = dy.size
     count = around + len(candidates)
-    bits = share.view(np.int32)
     for y in range(y0, y1):
         for x in range((out.shape[1] + 1) // 2):
             pixel = head[y, x]
@@ -182,9 +163,7 @@ def _mix(
                 for phase in range(4):
                     share[4 * k + phase] = pixel[5 + 4 * k + phase] - peak[phase]
             for k in range(4 * count):  # one long loop: vector code
-                fraction, power = _exponential(share[k])
-                share[k] = fraction
-                bits[k] += power << np.int32(23)
+                share[k] = exponential(share[k])
             total_0 = np.float32(0)
             total_1 = np.float32(0)
             total_2 = np.float32(0)

@@ -123,7 +123,7 @@ def hypotheses(
         [
             partial(
                 _weigh, mine, theirs, columns, found.base, coarse, others, found.apart, y0, y1, lines[k],
-                lines[k][:2].view(np.uint32), half, cost, gains,
+                lines[k][:3].view(np.uint32), half, cost, gains,
             )
             for k, (y0, y1) in enumerate(parts)
         ],
@@ -274,20 +274,28 @@ def _add_costs(
         total[x] += np.int32(8) * first + part[x] * np.int32(second - first)
 
 
+@inline
+def _place(stride: Any, shift: Any, part: Any, at: Any) -> None:
+    """Split eighths of pixels in `part`: column ``stride * x + shift`` less the whole pixels, and what is left."""
+    for x in range(at.size):
+        at[x] = np.int32(np.int32(stride * x) + shift) - (part[x] >> np.int32(3))
+    for x in range(at.size):
+        part[x] &= np.int32(7)
+
+
 @kernel
 def _weigh(
     left: NDArray[np.uint16], right: NDArray[np.uint32], columns: int, base: int, coarse: NDArray[np.float32],
     others: NDArray[np.float32], apart: int, y0: int, y1: int, lines: NDArray[np.int32], bits: NDArray[np.uint32],
     half: NDArray[np.float32], cost: NDArray[np.uint8], gains: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Compare the two images where each value says; `bits` are the first two of `lines`."""
+    """Compare the two images where each value says; `bits` are the first three of `lines`."""
     eight = np.float32(8)
     middle = np.float32(0.5)
     width = half.shape[1]
-    mine = bits[0]
-    differing = bits[1]
-    at = lines[2]
-    part = lines[3]
+    differing = bits[2]
+    at = lines[3]
+    part = lines[4]
     totals = lines[5:]
     for y in range(y0, y1):
         for k in range(totals.shape[0]):
@@ -300,23 +308,24 @@ def _weigh(
             row[x] = (upper[2 * x] + lower[2 * x] + upper[2 * x + 1] + lower[2 * x + 1]) * np.float32(0.25)
         for s in range(2):
             own = left[2 * y + s]
-            pairs = right[2 * y + s]
-            values = coarse[2 * y + s]
+            mine = bits[s]
             for x in range(width):
                 mine[x] = np.uint32(own[2 * x + s]) * np.uint32(0x10001)
-                place = np.int32(np.floor(values[2 * x + s] * eight + middle))
-                part[x] = place & np.int32(7)
-                at[x] = np.int32(2 * x + s - base) - (place >> np.int32(3))
+            values = coarse[2 * y + s]
+            for x in range(width):
+                part[x] = np.int32(np.floor(values[2 * x + s] * eight + middle))
+            _place(2, np.int32(s - base), part, at)
+            pairs = right[2 * y + s]
             _add_costs(mine, pairs, at, 0, part, columns, differing, totals[0])
             _add_costs(mine, pairs, at, apart, part, columns, differing, totals[1])
             _add_costs(mine, pairs, at, -apart, part, columns, differing, totals[2])
-            for k in range(others.shape[0]):
-                other = others[k, y]
-                for x in range(width):
-                    place = np.int32(np.floor(other[x] * eight + middle))
-                    part[x] = place & np.int32(7)
-                    at[x] = np.int32(2 * x + s - base) - (place >> np.int32(3))
-                _add_costs(mine, pairs, at, 0, part, columns, differing, totals[3 + k])
+        for k in range(others.shape[0]):
+            other = others[k, y]
+            for x in range(width):
+                part[x] = np.int32(np.floor(other[x] * eight + middle))
+            _place(2, np.int32(-base), part, at)
+            _add_costs(bits[0], right[2 * y], at, 0, part, columns, differing, totals[3 + k])
+            _add_costs(bits[1], right[2 * y + 1], at, 1, part, columns, differing, totals[3 + k])
         for x in range(width):
             cost[y, x] = np.uint8(totals[0, x] >> np.int32(1))
         for k in range(gains.shape[0]):

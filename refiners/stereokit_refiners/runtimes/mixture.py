@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.threads import run, spans
 from stereokit_refiners.networks.evidence import GAINS, LOGITS, WINDOWS
+from stereokit_refiners.outputs.exponential import exponential
 from stereokit_refiners.runtimes.evidence import Hypotheses
 
 __all__ = ["mixture"]
 
-_SMALL, _LARGE = (side // 2 for side in WINDOWS)
+assert WINDOWS == (3, 7)  # what the kernel is written for
 
 
 def mixture(
@@ -46,7 +47,7 @@ def mixture(
     parts = spans(-(-rows // 4), threads)
     width = found.half.shape[1]
     lines = [np.empty((14, width), np.float32) for _ in parts]
-    sums = [np.empty((3, width + 8), np.int32) for _ in parts]
+    sums = [np.empty((3, width + 8), np.int16) for _ in parts]
     wide = [np.empty((3, 2 * width), np.float32) for _ in parts]
     run(
         [
@@ -62,52 +63,59 @@ def mixture(
 
 
 @inline
-def _exponential(x: Any) -> Any:
-    """Return e**x to about 1e-6, for x from -40 to 40: a polynomial times a power of two, which is made of its bits."""
-    x = min(max(x, np.float32(-40)), np.float32(40)) * np.float32(1.4426950408889634)
-    whole = np.floor(x + np.float32(0.5))
-    z = (x - whole) * np.float32(0.6931471805599453)
-    p = np.float32(1 / 720)
-    p = p * z + np.float32(1 / 120)
-    p = p * z + np.float32(1 / 24)
-    p = p * z + np.float32(1 / 6)
-    p = p * z + np.float32(0.5)
-    p = p * z + np.float32(1)
-    p = p * z + np.float32(1)
-    return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+def _inside(y: Any, rows: Any) -> Any:
+    return min(max(y, 0), rows - 1)
 
 
 @inline
-def _sum_rows(plane: Any, y: Any, reach: Any, line: Any) -> None:
-    """Sum a plane's rows up to `reach` from row y; the line has four places more at either end."""
-    width = plane.shape[1]
-    last = np.int64(plane.shape[0] - 1)
-    inner = line[4 : 4 + width]
-    row = plane[y]
-    for x in range(width):
-        inner[x] = np.int32(row[x])
-    for dy in range(1, reach + 1):
-        above = plane[max(y - dy, 0)]
-        below = plane[min(y + dy, last)]
-        for x in range(width):
-            inner[x] += np.int32(above[x]) + np.int32(below[x])
+def _go_on(line: Any) -> None:
+    """Fill four places at either end of a line with its first and its last value."""
+    last = line.size - 5
     for x in range(4):
-        line[x] = inner[0]
-        line[4 + width + x] = inner[width - 1]
+        line[x] = line[4]
+        line[last + 1 + x] = line[last]
+
+
+@inline
+def _sum_rows(plane: Any, y: Any, near: Any, around: Any) -> None:
+    """Sum three and seven rows of a plane around row y; lines have four places more at either end."""
+    rows, width = plane.shape
+    inner = near[4 : 4 + width]
+    outer = around[4 : 4 + width]
+    a = plane[_inside(y - 1, rows)]
+    b = plane[_inside(y, rows)]
+    c = plane[_inside(y + 1, rows)]
+    for x in range(width):
+        inner[x] = np.int16(np.int16(a[x]) + np.int16(b[x]) + np.int16(c[x]))
+    a = plane[_inside(y - 3, rows)]
+    b = plane[_inside(y - 2, rows)]
+    c = plane[_inside(y + 2, rows)]
+    d = plane[_inside(y + 3, rows)]
+    for x in range(width):
+        outer[x] = np.int16(inner[x] + np.int16(a[x]) + np.int16(b[x]) + np.int16(c[x]) + np.int16(d[x]))
+    _go_on(near)
+    _go_on(around)
+
+
+@inline
+def _by_two(line: Any, out: Any) -> None:
+    for x in range(line.size):
+        out[2 * x] = line[x]
+        out[2 * x + 1] = line[x]
 
 
 @kernel
 def _mix(
     head: NDArray[np.float32], coarse: NDArray[np.float32], others: NDArray[np.float32], gains: NDArray[np.int8],
-    base: int, apart: float, y0: int, y1: int, lines: NDArray[np.float32], sums: NDArray[np.int32],
+    base: int, apart: float, y0: int, y1: int, lines: NDArray[np.float32], sums: NDArray[np.int16],
     wide: NDArray[np.float32], disparity: NDArray[np.float32], sure: NDArray[np.float32],
 ) -> None:  # fmt: skip
     rows, columns = disparity.shape
     width = gains.shape[2]
     step = np.float32(apart)
     origin = np.float32(base)
-    small = np.float32(1 / 16 / (2 * _SMALL + 1) ** 2)
-    large = np.float32(1 / 16 / (2 * _LARGE + 1) ** 2)
+    small = np.float32(1 / 16 / 9)
+    large = np.float32(1 / 16 / 49)
     factors = lines[:4]
     share = lines[4]  # of the coarse map
     rest = lines[5]
@@ -132,47 +140,53 @@ def _mix(
                     logits[k, 2 * x + 1] = pixels[x, 4 * k + 2 * i + 1]
                 certain[2 * x] = pixels[x, LOGITS + GAINS + 2 * i]
                 certain[2 * x + 1] = pixels[x, LOGITS + GAINS + 2 * i + 1]
-            for x in range(width):
-                certain[x] = np.float32(1) / (np.float32(1) + _exponential(-certain[x]))
-                share[x] = np.float32(1)
-                rest[x] = np.float32(0)
-                total[x] = np.float32(1)
             for k in range(6):
-                _sum_rows(gains[k], h, _SMALL, near)
-                _sum_rows(gains[k], h, _LARGE, around)
+                _sum_rows(gains[k], h, near, around)
                 for x in range(width + 6):
-                    three[x + 1] = around[x] + around[x + 1] + around[x + 2]
+                    three[x + 1] = np.int16(around[x] + around[x + 1] + around[x + 2])
                 prior = logits[k]
                 first = factors[0 if k < 2 else 1]
                 second = factors[2 if k < 2 else 3]
                 for x in range(width):
-                    less = np.float32(np.int32(near[x + 3] + near[x + 4] + near[x + 5]))
-                    wider = np.float32(np.int32(three[x + 2] + around[x + 4] + three[x + 6]))
-                    prior[x] = _exponential(prior[x] + less * first[x] + wider * second[x])
-                if k < 2:
-                    value = step if k == 1 else -step
-                    for x in range(width):
-                        share[x] += prior[x]
-                        rest[x] += prior[x] * value
-                        total[x] += prior[x]
-                else:
-                    other = others[k - 2, h]
-                    for x in range(width):
-                        rest[x] += prior[x] * other[x]
-                        total[x] += prior[x]
+                    less = np.float32(np.int32(near[x + 3]) + np.int32(near[x + 4]) + np.int32(near[x + 5]))
+                    prior[x] += less * first[x]
+                for x in range(width):
+                    wider = np.float32(np.int32(three[x + 2]) + np.int32(around[x + 4]) + np.int32(three[x + 6]))
+                    prior[x] = exponential(prior[x] + wider * second[x])
+            less = logits[0]
+            more = logits[1]
             for x in range(width):
-                inverse = np.float32(1) / total[x]
-                factor = share[x] * inverse
-                term = rest[x] * inverse
-                for j in range(2):
-                    wide[0, 2 * x + j] = factor
-                    wide[1, 2 * x + j] = term
-                    wide[2, 2 * x + j] = certain[x]
+                share[x] = np.float32(1) + less[x] + more[x]
+            for x in range(width):
+                rest[x] = (more[x] - less[x]) * step
+            a = logits[2]
+            b = logits[3]
+            c = logits[4]
+            d = logits[5]
+            for x in range(width):
+                total[x] = np.float32(1) / (share[x] + ((a[x] + b[x]) + (c[x] + d[x])))
+            for k in range(4):
+                weight = logits[2 + k]
+                other = others[k, h]
+                for x in range(width):
+                    rest[x] += weight[x] * other[x]
+            for x in range(width):
+                share[x] *= total[x]
+            for x in range(width):
+                rest[x] *= total[x]
+            for x in range(width):
+                certain[x] = np.float32(1) / (np.float32(1) + exponential(-certain[x]))
+            _by_two(share, wide[0])
+            _by_two(rest, wide[1])
+            _by_two(certain, wide[2])
+            factor = wide[0]
+            term = wide[1]
+            like = wide[2]
             for r in range(2 * h, min(2 * h + 2, rows)):
                 line = coarse[r]
                 out = disparity[r]
                 for x in range(columns):
-                    out[x] = line[x] * wide[0, x] + wide[1, x] + origin
+                    out[x] = line[x] * factor[x] + term[x] + origin
                 out = sure[r]
                 for x in range(columns):
-                    out[x] = wide[2, x]
+                    out[x] = like[x]

@@ -50,6 +50,7 @@ class _OpenVinoOps:
         self.weights = weights
         self.ranges = ranges
         self.scales: dict[int, tuple[Any, NDArray[np.float32]]] = {}  # of the channels of nodes that hold 8 bits
+        self.lifted: set[int] = set()  # those of them that stand for 128 less
 
     def conv(self, name: str, inputs: Sequence[Any], *, activate: bool = True) -> Any:
         layer = self.table[name]
@@ -89,10 +90,11 @@ class _OpenVinoOps:
         return self._doubled(x, mode="nearest", coordinate_transformation_mode="asymmetric", nearest_mode="floor")
 
     def bytes(self, x: Any) -> Any:
-        """Return a node of bytes as what it is: numbers, 8 bits each."""
-        ends = _const(-128), _const(127)
+        """Return a node of unsigned bytes, which stand for numbers 128 below them, as 8 bits."""
+        ends = _const(0), _const(255)
         y = op.fake_quantize(op.convert(x, "f32"), *ends, *ends, 256)
         self.scales[id(y)] = y, np.ones(x.get_output_shape(0)[1], np.float32)
+        self.lifted.add(id(y))
         return y
 
     def _doubled(self, x: Any, mode: str, **attributes: str) -> Any:
@@ -140,8 +142,12 @@ class _OpenVinoOps:
             if not members:
                 continue
             x = inputs[members[0]] if len(members) == 1 else op.concat([inputs[k] for k in members], 1)
-            kernel = _kernel(np.concatenate([parts[k] for k in members], 1), integer)
-            z = op.convolution(x, kernel, [layer.stride] * 2, [side] * 2, [side] * 2, [1, 1])
+            taps = np.concatenate([parts[k] for k in members], 1)
+            if id(x) in self.lifted:  # before all else: a border would not be lifted
+                assert layer.kernel == 1
+                taps = _rounded_to_steps(taps)
+                bias = bias - 128 * taps.sum((1, 2, 3))
+            z = op.convolution(x, _kernel(taps, integer), [layer.stride] * 2, [side] * 2, [side] * 2, [1, 1])
             y = z if y is None else op.add(y, z)
         return op.add(y, _const(bias.reshape(1, -1, 1, 1)))
 
@@ -150,12 +156,21 @@ def _const(values: Any) -> Any:
     return op.constant(np.asarray(values, np.float32))
 
 
+def _bound(weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(np.maximum(np.abs(weight).max(axis=(1, 2, 3), keepdims=True), 1e-8), np.float32)
+
+
+def _rounded_to_steps(weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return weights as `_kernel` will hold them."""
+    step = _bound(weight) / np.float32(WEIGHT_STEPS)
+    return np.asarray(np.rint(weight / step) * step, np.float32)
+
+
 def _kernel(weight: NDArray[np.float32], integer: bool) -> Any:
     node = _const(np.ascontiguousarray(weight))
     if not integer:
         return node
-    bound = np.maximum(np.abs(weight).max(axis=(1, 2, 3), keepdims=True), 1e-8)
-    bound = bound * (127 / WEIGHT_STEPS)  # OpenVINO wants all 255 levels; the outer ones stay without use
+    bound = _bound(weight) * (127 / WEIGHT_STEPS)  # OpenVINO wants all 255 levels; the outer ones stay without use
     low, high = _const(-bound), _const(bound)
     return op.fake_quantize(node, low, high, low, high, 255)
 
@@ -173,7 +188,7 @@ def build(network: Network, weights: Weights, rows: int, columns: int, ranges: R
     for name, channels in network.inputs.items():
         size = [1, rows, columns, channels] if network.innermost else [1, channels, rows, columns]
         whole = network.innermost and bool(ranges)
-        parameters[name] = inputs[name] = op.parameter(size, np.int8 if whole else np.float32, name=name)
+        parameters[name] = inputs[name] = op.parameter(size, np.uint8 if whole else np.float32, name=name)
         if network.innermost:
             inputs[name] = op.transpose(parameters[name], op.constant(np.array([0, 3, 1, 2], np.int64)))
         if whole:
@@ -219,7 +234,11 @@ def compiled(
         with requests.take() as free:
             if network.innermost:
                 for k, name in enumerate(network.inputs):
-                    np.copyto(free.get_input_tensor(k).data[0], np.moveaxis(inputs[name], 0, 2))
+                    array, tensor = np.moveaxis(inputs[name], 0, 2), free.get_input_tensor(k).data[0]
+                    if tensor.dtype == np.uint8:
+                        np.bitwise_xor(array.view(np.uint8), np.uint8(128), out=tensor)  # 128 more
+                    else:
+                        np.copyto(tensor, array)
                 free.infer()
             else:
                 free.infer([inputs[name][None] for name in network.inputs], share_inputs=True)

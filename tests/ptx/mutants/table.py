@@ -17,7 +17,7 @@ _BARRIER, _SHUFFLE = "bad barrier", "bad shuffle"
 _ROUNDING, _OVERFLOW, _BORDER, _RULE = "rounding", "overflow", "border", "wrong rule"
 
 OUTCOMES = {
-    _RACE: {"race"},
+    _RACE: {"race", "wrong result"},  # where the loser's write is lost before anybody else reads
     _BOUNDS: {"out of bounds"},
     _UNWRITTEN: {"uninitialised", "wrong result"},  # registers that nobody wrote are garbage
     _BARRIER: {"divergent barrier"},

@@ -159,7 +159,6 @@ def test_threads_do_not_change_the_result(name, backend, precision):
 
 @pytest.mark.parametrize("backend", LEARNED)
 def test_calls_from_four_threads_at_once_are_single_calls(backend):
-    pytest.importorskip(backend)
     refiner = LearnedRefiner.of(random_content("stereovae"), backend=backend)
     sizes = [(32, 40), (24, 48), (32, 40), (17, 33)]
     expected = [refiner(coarse_of(s, k), image_of(s, k)).disparity for k, s in enumerate(sizes)]

@@ -406,9 +406,9 @@ def _plane(first, slope):
 @pytest.mark.parametrize(("scale", "most"), [(1, 0.05), (0.5, 0.05), (0.25, 0.09)])
 def test_shipped_weights_have_no_bias_on_planes(scale, most, first, slope):
     left, right, truth = _plane(first, slope)
-    found = stereokit.match(left, right, "S2", max_disparity=96, scale=scale, refiner="general", device="cpu")
+    disparity = stereokit.match(left, right, "S2", max_disparity=96, scale=scale, refiner="general", device="cpu")
     seen = np.arange(truth.shape[1]) >= truth
-    assert abs(float(np.median((found - truth)[seen]))) < most
+    assert abs(float(np.median((disparity - truth)[seen]))) < most
 
 
 def test_shipped_weights_follow_an_offset_of_all_disparities():

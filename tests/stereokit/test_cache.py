@@ -69,7 +69,7 @@ def test_without_a_writable_cache_kernels_are_kept_among_the_temporary_files(pac
     user = f"stereokit-{os.getuid()}" if hasattr(os, "getuid") else "stereokit"
     assert str(tmp_path / user) in warning and "NUMBA_CACHE_DIR" in warning
     contents = {path: path.read_bytes() for path in (tmp_path / user).rglob("*.nb*")}
-    assert any("fill_rows" in path.name for path in contents) and any("_literal" in path.name for path in contents)
+    assert any("fill_rows" in path.name for path in contents) and any("_interleave" in path.name for path in contents)
     use(package, tmp_path, None)
     assert contents == {path: path.read_bytes() for path in (tmp_path / user).rglob("*.nb*")}  # not compiled again
 

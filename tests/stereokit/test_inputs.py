@@ -64,8 +64,8 @@ def test_the_whole_range_of_float64_is_no_overflow():
     left, right = (image.astype(np.float64) for image in pair_of(seed=3))
     low, high = np.finfo(np.float64).min, np.finfo(np.float64).max
     left[0, 0], right[0, 0] = low, high
-    disparity = matched(left, right)
-    assert np.isnan(disparity[0, 0]) and np.isfinite(disparity.ravel()[1:]).all()  # so far from the rest it marks no data
+    result = matched(left, right)
+    assert np.isnan(result[0, 0]) and np.isfinite(result.ravel()[1:]).all()  # so far from the rest it marks no data
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])

@@ -17,7 +17,7 @@ _BARRIER, _SHUFFLE = "bad barrier", "bad shuffle"
 _ROUNDING, _OVERFLOW, _BORDER, _RULE = "rounding", "overflow", "border", "wrong rule"
 
 OUTCOMES = {
-    _RACE: {"race", "wrong result"},  # where the loser's write is lost before anybody else reads
+    _RACE: {"race"},
     _BOUNDS: {"out of bounds"},
     _UNWRITTEN: {"uninitialised", "wrong result"},  # registers that nobody wrote are garbage
     _BARRIER: {"divergent barrier"},
@@ -249,7 +249,7 @@ MUTANTS = [
     Mutant(
         "a root that another thread lowered is forgotten", "postprocess.speckle_cuda",
         "a = u32(cuda.atomic.min(parent, high, low))\napart = a != high",
-        "a = u32(cuda.atomic.min(parent, high, low))\napart = False", _RACE, "post.check_speckle",
+        "a = u32(cuda.atomic.min(parent, high, low))\napart = False", _RULE, "post.check_speckle",
     ),
     Mutant(
         "parents are read as if nobody wrote them", "postprocess.speckle_cuda",

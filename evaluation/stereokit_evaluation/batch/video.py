@@ -18,7 +18,7 @@ from stereokit.errors import FileError, InputError, OptionError
 from stereokit.io import parsing, split_views
 from stereokit.io.quiet import quiet_decoders
 
-__all__ = ["FramePair", "Frames", "Video"]
+__all__ = ["FramePair", "Frames", "Video", "retrieve_images"]
 
 Image = NDArray[np.uint8]
 
@@ -130,14 +130,22 @@ def _open(path: Path) -> Any:
     return capture
 
 
-def _frame(name: str, captures: list[Any], layout: str) -> FramePair:
+def retrieve_images(captures: list[Any]) -> list[Image] | None:
+    """Return the frames that the captures have grabbed, RGB or grey; None if one cannot be decoded."""
     images = []
     for capture in captures:
         with quiet_decoders():
             good, image = capture.retrieve()
         if not good or image is None:
-            return FramePair(name, None, None, "the frame cannot be decoded")
+            return None
         images.append(np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image))
+    return images
+
+
+def _frame(name: str, captures: list[Any], layout: str) -> FramePair:
+    images = retrieve_images(captures)
+    if images is None:
+        return FramePair(name, None, None, "the frame cannot be decoded")
     if len(images) == 1:
         images = list(split_views(images[0], layout))
     return FramePair(name, images[0], images[1])

@@ -14,14 +14,13 @@ from threading import Event
 from typing import Any, Protocol
 
 import cv2
-import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError, OptionError
-from stereokit.io import read_pair
+from stereokit.io import read_pair, split_views
 from stereokit.io.quiet import quiet_decoders
 from stereokit_evaluation.batch.pairs import folder_pairs, folders_pairs
-from stereokit_evaluation.batch.video import Video
+from stereokit_evaluation.batch.video import Video, retrieve_images
 
 __all__ = ["Cameras", "Folder", "Frame", "Recording", "Source", "open_source"]
 
@@ -264,14 +263,10 @@ def _rate(capture: Any) -> float:
 
 
 def _decoded(number: int, captures: list[Any]) -> Frame:
-    images = []
-    for capture in captures:
-        with quiet_decoders():
-            good, image = capture.retrieve()
-        if not good or image is None:
-            raise InputError(f"frame {number} cannot be decoded")
-        images.append(np.ascontiguousarray(image[:, :, ::-1] if image.ndim == 3 else image))
+    images = retrieve_images(captures)
+    if images is None:
+        raise InputError(f"frame {number} cannot be decoded")
     if len(images) == 1:
-        half = images[0].shape[1] // 2
-        images = [np.ascontiguousarray(images[0][:, :half]), np.ascontiguousarray(images[0][:, half : 2 * half])]
+        half = images[0].shape[1] // 2  # of an odd width, as a camera may have, the last column is left out
+        images = list(split_views(images[0][:, : 2 * half], "side-by-side"))
     return Frame(number, images[0], images[1])

@@ -8,7 +8,8 @@ blank scenes have few too, so a low density is a warning and no error.
 Where the density is low, or the rows at what was measured are apart (`stereokit.pairs.residual`), the pair is looked at
 closely (`stereokit.pairs.check`), which costs more than many a match: a matcher does so at the first pair that looks
 wrong, the second, the fourth, and so on, so that a long sequence from a bad rig costs little more than one from a good
-one.
+one. Rows take a quarter of a millisecond, which is much beside the match of a small pair: of those one in several is
+looked at, the first always.
 """
 
 from __future__ import annotations
@@ -19,27 +20,37 @@ import threading
 import numpy as np
 
 from stereokit.images.gray import GrayPair
-from stereokit.pairs.check import check_gray, same_pixels
+from stereokit.pairs.check import Fault, check_gray, same_pixels
 from stereokit.pairs.residual import row_residual
 from stereokit.result import Disparity
 
-__all__ = ["PairWatch", "density_warnings", "min_density", "same_pixels", "view_warnings"]
+__all__ = ["PairWatch", "density_fault", "min_density", "same_fault", "same_pixels", "unusable_fault"]
 
 _MIN_DENSITY, _DENSITY_PER_HALVING, _MAX_MIN_DENSITY = 0.3, 0.05, 0.45
 """Density below which a map of 128 levels gets a warning; the increase per halving of the levels; and its bound."""
 _FAR_ROWS, _VERY_FAR_ROWS = 0.45, 0.75
 """Pixels of row offset beyond which a pair is looked at closely, and beyond which it is told of in any case."""
+_CELLS_PER_LOOK = 6e6
+"""Pixels times levels that are matched, in 5 milliseconds or more, between two looks at the rows."""
 
 
 class PairWatch:
-    """What looks wrong with the pairs that one matcher sees; may be used by many threads at the same time."""
+    """What looks wrong with the pairs that one matcher sees; may be used by many threads at the same time.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    scale : float
+        Size of the matching, of which its time depends.
+    """
+
+    def __init__(self, scale: float = 1.0) -> None:
+        self._scale = scale
         self._lock = threading.Lock()
         self._seen = 0  # pairs that looked wrong
+        self._cells = _CELLS_PER_LOOK  # matched since the last look at the rows
 
-    def warnings(self, pair: GrayPair, result: Disparity, min_disparity: int, max_disparity: int) -> list[str]:
-        """Return the warnings about a pair and its map, a line each.
+    def faults(self, pair: GrayPair, result: Disparity, min_disparity: int, max_disparity: int) -> list[Fault]:
+        """Return the faults of a pair and its map, mostly one at most.
 
         Parameters
         ----------
@@ -50,31 +61,40 @@ class PairWatch:
         """
         usable = pair.left.size - (0 if pair.left_bad is None else int(np.count_nonzero(pair.left_bad)))
         if usable == 0:
-            return ["no pixel is usable: mask, no-data value, alpha or black borders exclude them all"]
+            return [unusable_fault()]
         if same_pixels(pair.left, pair.right):
-            return view_warnings(True)
-        density = np.count_nonzero(result.valid) / usable
-        lines = density_warnings(density, min_disparity, max_disparity)
-        residual = row_residual(pair, result.disparity, result.valid)
+            return [same_fault()]
+        low = density_fault(np.count_nonzero(result.valid) / usable, min_disparity, max_disparity)
+        cells = pair.left.size * (max_disparity - min_disparity) * self._scale**3
+        look = low is None and self._is_due(cells)
+        residual = row_residual(pair, result.disparity, result.valid) if look else None
         apart = 0.0 if residual is None else abs(residual)
-        if not lines and apart < _FAR_ROWS:
+        if low is None and apart < _FAR_ROWS:
             return []
         with self._lock:
             self._seen += 1
             closely = self._seen & (self._seen - 1) == 0
         if closely:
             report = check_gray(pair, min_disparity, max_disparity, quick=True)
-            serious = [fault.message for fault in report.faults if fault.serious]
+            serious = [fault for fault in report.faults if fault.serious]
             if serious:
                 return serious
-            if report.rows_known and not lines:
+            if report.rows_known and low is None:
                 return []
-        if not lines and residual is not None and apart > _VERY_FAR_ROWS:
-            side = "lower" if residual > 0 else "higher"
-            lines = [
-                f"rows do not meet: the right view lies about {apart:.1f} px {side}: rectify the pair, or see --align"
-            ]
-        return lines
+        if low is not None:
+            return [low]
+        if residual is None or apart <= _VERY_FAR_ROWS:
+            return []
+        side = "lower" if residual > 0 else "higher"
+        words = f"rows do not meet: the right view lies about {apart:.1f} px {side}: rectify the pair, or see --align"
+        return [Fault("rows", words)]
+
+    def _is_due(self, cells: float) -> bool:
+        """Return whether enough was matched since the last look at the rows; count `cells` more."""
+        with self._lock:
+            due = self._cells + cells >= _CELLS_PER_LOOK
+            self._cells = 0.0 if due else self._cells + cells
+        return due
 
 
 def min_density(levels: int) -> float:
@@ -82,13 +102,18 @@ def min_density(levels: int) -> float:
     return min(_MAX_MIN_DENSITY, _MIN_DENSITY + _DENSITY_PER_HALVING * max(0.0, math.log2(128 / levels)))
 
 
-def view_warnings(same: bool) -> list[str]:
-    """Return a warning line if the two views are the `same`."""
-    return ["left and right hold the same pixels: was one view given twice?"] if same else []
+def same_fault() -> Fault:
+    """Return the fault of a pair whose views have equal pixels."""
+    return Fault("same", "left and right hold the same pixels: was one view given twice?")
 
 
-def density_warnings(density: float, min_disparity: int, max_disparity: int) -> list[str]:
-    """Return a warning line if the density is too low.
+def unusable_fault() -> Fault:
+    """Return the fault of a pair without any usable pixel."""
+    return Fault("unusable", "no pixel is usable: mask, no-data value, alpha or black borders exclude them all")
+
+
+def density_fault(density: float, min_disparity: int, max_disparity: int) -> Fault | None:
+    """Return the fault of a map whose density is too low, None if it is not.
 
     Parameters
     ----------
@@ -98,9 +123,10 @@ def density_warnings(density: float, min_disparity: int, max_disparity: int) -> 
         Of the matcher, pixels.
     """
     if density >= min_density(max_disparity - min_disparity):
-        return []
+        return None
     shown = f"{100 * density:.1f}" if density < 0.1 else f"{100 * density:.0f}"
-    return [
+    return Fault(
+        "density",
         f"only {shown} % of the pixels could be measured: are the views exchanged, their rows not aligned, "
-        f"or disparities outside of {min_disparity} .. {max_disparity - 1}?"
-    ]
+        f"or disparities outside of {min_disparity} .. {max_disparity - 1}?",
+    )

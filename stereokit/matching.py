@@ -28,6 +28,7 @@ from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit.options import MatchOptions, StageOptions, WarmupOptions
+from stereokit.pairs.residual import row_residual
 from stereokit.pipeline import CpuPipeline, Pipeline, concluded, with_blank
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
@@ -180,7 +181,7 @@ class Matcher:
         """Set what every matcher has, however it is made."""
         self._pipeline = pipeline
         self.threads = threads
-        self._watch = PairWatch()
+        self._watch = PairWatch(self.scale)
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
         """Return the bytes of the buffers for a pair; see `stereokit.pipeline.Pipeline`."""
@@ -348,8 +349,8 @@ class Matcher:
             pair = gray_pair(left, right, self.settings.nodata, mask, right_mask)
         result = self.match_gray(pair, threads)
         with span("clean", "signs of a bad pair"):
-            lines = self._watch.warnings(pair, result, self.min_disparity, self.max_disparity)
-        return result, lines
+            faults = self._watch.faults(pair, result, self.min_disparity, self.max_disparity)
+        return result, [fault.message for fault in faults]
 
     def match_gray(self, pair: GrayPair, threads: int, keeps_blank: bool | None = None) -> Disparity:
         """Match a pair that was checked and is grey.
@@ -497,6 +498,7 @@ def compile_kernels(matcher: Matcher, shape: tuple[int, ...] = (), dtype: Any = 
     image[:, ::2] = 1
     with collecting():
         matcher(image, image)
+        row_residual(gray_pair(image, image), np.zeros((side, side), np.float32), np.ones((side, side), np.bool_))
 
 
 def _forget_matchers() -> None:

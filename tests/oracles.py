@@ -418,6 +418,43 @@ def divergence(mean, deviation, steps=20_000):
     return total
 
 
+def row_shifts(left, right, disparity, valid, scale=1.0, candidates=2500, points=200, slope=2.0):
+    """One step of Lucas and Kanade (1981) at the steepest points of a grid, (shift, is it of both directions) each."""
+    height, width = disparity.shape
+    step = max(1, int(math.sqrt(height * width / candidates)))
+    ranked = []
+    for y in range(3, height - 3, step):
+        for x in range(3, width - 3, step):
+            steepness = abs(int(left[y + 1, x]) - int(left[y - 1, x])) * scale
+            place = x - float(disparity[y, x])
+            if valid[y, x] and 3 <= place < width - 4 and steepness > 2 * slope:
+                ranked.append((min(int(steepness), 511), y, x, place))
+    ranked.sort(key=lambda point: -point[0])  # equal ones stay in the order of the grid
+    shifts = []
+    for _, y, x, place in sorted(ranked[:points], key=lambda point: point[1:]):
+        patch = np.array([[left[y + j, x + i] for i in range(-3, 4)] for j in range(-3, 4)], float)
+        column, part = int(place), place - int(place)
+        other = np.empty((7, 7))
+        for j in range(-3, 4):
+            for i in range(-3, 4):
+                a, b = float(right[y + j, column + i]), float(right[y + j, column + i + 1])
+                other[j + 3, i + 3] = a + part * (b - a)
+        both = (patch + other) / 2
+        down = ((both[2:] - both[:-2]) / 2)[:, 1:-1]
+        across = ((both[:, 2:] - both[:, :-2]) / 2)[1:-1]
+        less = (patch - other)[1:-1, 1:-1]
+        less = less - less.mean()
+        system = np.array(
+            [[(down * down).sum(), (down * across).sum()], [(down * across).sum(), (across * across).sum()]]
+        )
+        target = np.array([(down * less).sum(), (across * less).sum()])
+        if system[0, 0] <= 0:
+            continue
+        is_regular = np.linalg.det(system) > 0.02 * system[0, 0] ** 2
+        shifts.append((np.linalg.solve(system, target)[0] if is_regular else target[0] / system[0, 0], is_regular))
+    return shifts
+
+
 def outliers(estimate, truth):
     """Count of bad pixels and of known ones (truth above 0): off by more than 3 pixels and more than 5 %."""
     bad = known = 0

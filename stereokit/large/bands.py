@@ -13,20 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.checks import PairWatch, density_warnings, same_pixels, view_warnings
+from stereokit.checks import PairWatch, density_fault, same_fault, same_pixels, unusable_fault
 from stereokit.images.evidence import joined
 from stereokit.images.intensity import IntensityMapping
 from stereokit.large.intensity import MaskedSource, Ranges, read_pair
 from stereokit.large.plan import Plan, Span
 from stereokit.matching import Matcher
+from stereokit.pairs.check import Fault
 from stereokit.pipeline import with_blank
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows
 
 __all__ = ["BandAssembler"]
 
-_OF_WINDOWS = ("only", "no pixel", "left and right hold the same pixels")
-"""Beginnings of warnings that a window alone, of nothing but water, may have."""
+_OF_WINDOWS = frozenset(("density", "unusable", "same"))
+"""Kinds of fault that a window alone, of nothing but water, may have."""
 
 
 class BandAssembler:
@@ -61,7 +62,7 @@ class BandAssembler:
         progress: Callable[[int, int], object] | None,
     ) -> None:
         self.measured, self.views_equal = 0, True
-        self._usable, self._watch, self._lines = 0, PairWatch(), list[str]()
+        self._usable, self._watch, self._faults = 0, PairWatch(matcher.scale), list[Fault]()
         self._image_matcher, self._sources, self._mapping, self._ranges = matcher, sources, mapping, ranges
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
@@ -109,19 +110,24 @@ class BandAssembler:
         self._usable += pair.left[inner].size
         if pair.left_bad is not None:
             self._usable -= int(np.count_nonzero(pair.left_bad[inner]))
-        if not self._lines:
-            self._lines = self._watch.warnings(pair, result, *self._range)
+        if not self._faults:
+            self._faults = self._watch.faults(pair, result, *self._range)
         self.measured += int(np.count_nonzero(result.valid[inner]))
 
     def warnings(self) -> list[str]:
         """Return the warnings about the pair and its map, a line each, when all windows are matched."""
+        return [fault.message for fault in self._final_faults()]
+
+    def _final_faults(self) -> list[Fault]:
         if self.views_equal:
-            return view_warnings(True)
+            return [same_fault()]
         if not self._usable:
-            return ["no pixel is usable: mask, no-data value, alpha or black borders exclude them all"]
-        density = density_warnings(self.measured / self._usable, *self._range)
-        closer = [line for line in self._lines if not line.startswith(_OF_WINDOWS)]
-        return (closer or density) if density or any(line.startswith("rows") for line in closer) else []
+            return [unusable_fault()]
+        low = density_fault(self.measured / self._usable, *self._range)
+        closer = [fault for fault in self._faults if fault.kind not in _OF_WINDOWS]
+        if low is not None:
+            return closer or [low]
+        return closer if any(fault.kind == "rows" for fault in closer) else []
 
     def _finished(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
         settings = self._image_matcher.settings

@@ -31,14 +31,17 @@ KINDS = {
     "rows": "the rows of the views do not meet",
     "range": "disparities lie outside of the range",
     "unrelated": "the views do not show the same scene",
+    "density": "few pixels could be measured",
+    "unusable": "no pixel may be matched",
     "exposure": "the views differ in brightness",
     "sharpness": "the views differ in sharpness",
     "blank": "much of the left view has no texture",
     "saturated": "much of the left view is white",
 }
-"""What can be wrong with a pair, the worst first; up to "unrelated" the map suffers."""
+"""What can be wrong with a pair, the worst first; up to "unusable" the map suffers. "density" and "unusable" are what
+matchers say, who have a map."""
 
-SERIOUS = frozenset(("same", "exchanged", "mirrored", "rotated", "rows", "range", "unrelated"))
+SERIOUS = frozenset(list(KINDS)[: list(KINDS).index("unusable") + 1])
 
 _SIDE = 1000  # pixels of the longer side on which features are looked for
 _QUICK_SIDE = 640

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import stereokit
+from stereokit.checks import PairWatch, density_fault, min_density, same_pixels
 from stereokit.checks import check_gray as check
-from stereokit.checks import density_warnings, min_density, same_pixels
 from stereokit.errors import StereokitWarning
+from stereokit.images.gray import gray_pair
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit.result import Disparity
 
@@ -91,8 +92,35 @@ def test_density_decides():
     for measured, number in ((0, "0.0 %"), (9, "9.0 %"), (34, "34 %"), (35, None), (100, None)):
         valid = (np.arange(100) < measured).reshape(10, 10)
         result = Disparity(np.zeros((10, 10), np.float32), valid)
-        lines = density_warnings(result.density, -4, 60)
-        assert (not lines) if number is None else (f"only {number}" in lines[0] and "-4 .. 59" in lines[0])
+        fault = density_fault(result.density, -4, 60)
+        if number is None:
+            assert fault is None
+        else:
+            assert fault.kind == "density" and f"only {number}" in fault.message and "-4 .. 59" in fault.message
+
+
+@pytest.mark.parametrize(
+    ("shape", "levels", "scale", "due"),
+    [
+        ((100, 500), 128, 1.0, [1, 1, 1, 1]),
+        ((100, 500), 40, 1.0, [1, 0, 0, 1]),
+        ((100, 500), 128, 0.5, [1, 0, 0, 0]),
+    ],
+)
+def test_rows_of_small_pairs_are_looked_at_now_and_then(shape, levels, scale, due, monkeypatch):
+    """A look costs a quarter of a millisecond: it is due after 6 million cells of matching, and at the first pair."""
+    looks = []
+    monkeypatch.setattr("stereokit.checks.row_residual", lambda *_: looks.append(1))
+    rng = np.random.default_rng(0)
+    pair = gray_pair(*(rng.integers(0, 256, shape, np.uint8) for _ in range(2)))
+    watch, counts = PairWatch(scale), []
+    for _ in due:
+        looks.clear()
+        assert watch.faults(pair, Disparity(np.zeros(shape, np.float32), np.ones(shape, bool)), 0, levels) == []
+        counts.append(len(looks))
+    assert counts == due
+    bad = Disparity(np.zeros(shape, np.float32), np.zeros(shape, bool))
+    assert [fault.kind for fault in watch.faults(pair, bad, 0, levels)] != []  # density is seen at every pair
 
 
 def test_same_pixels():

@@ -6,6 +6,7 @@ import json
 
 import cv2
 import numpy as np
+import oracles
 import pytest
 from typer.testing import CliRunner
 
@@ -188,6 +189,35 @@ def test_rows_are_measured_without_features(offset):
     assert row_residual(gray_pair(left, right), truth, np.zeros_like(valid)) is None
     tiny = np.zeros((8, 9), np.uint8)
     assert row_residual(gray_pair(tiny, tiny), np.zeros((8, 9), np.float32), np.ones((8, 9), bool)) is None
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("stripes", [False, True])
+def test_the_rows_of_few_points_are_those_of_the_oracle(dtype, stripes):
+    """With stripes across, only the slope down tells, and the median is over the points that tell by it alone."""
+    rng = np.random.default_rng(4)
+    factor = 1 if dtype == np.uint8 else 150
+    left = rng.integers(0, 256, (60, 90)) * factor
+    if stripes:
+        left[:] = np.repeat(rng.integers(0, 256, (60, 1)) * factor, 90, axis=1)
+    left = cv2.GaussianBlur(left.astype(dtype), (0, 0), 1)
+    right = cv2.warpAffine(left, np.array([[1, 0, -4.5], [0, 1, 0.4]]), (90, 60))
+    disparity = rng.uniform(4, 5, left.shape).astype(np.float32)
+    valid = rng.random(left.shape) < 0.8
+    pair = gray_pair(left, right)
+    scale = 1.0 if dtype == np.uint8 else 255 / (pair.span[1] - pair.span[0])
+    shifts = oracles.row_shifts(pair.left, pair.right, disparity, valid, scale)
+    regular = [shift for shift, is_regular in shifts if is_regular]
+    assert len(shifts) == 200 and (len(regular) < 30) == stripes
+    expected = np.median(regular if not stripes else [shift for shift, _ in shifts])
+    assert row_residual(pair, disparity, valid) == pytest.approx(expected, abs=1e-4) and abs(expected) > 0.1
+    few = valid & (np.arange(90) < 12)
+    few[:, :9] = False
+    shifts = oracles.row_shifts(pair.left, pair.right, disparity, few, scale)
+    told = row_residual(pair, disparity, few)
+    assert 30 <= len(shifts) < 200 and told == pytest.approx(
+        np.median([shift for shift, is_regular in shifts if is_regular or stripes]), abs=1e-4
+    )
 
 
 @pytest.mark.parametrize(("offset", "roll"), [(1.0, 0.0), (-1.3, 0.0), (0.5, 0.3)])

@@ -1,11 +1,12 @@
-"""Detection and false alarms of `stereokit.check_pair`: good pairs of all data sets, and the same pairs disturbed.
+"""Detection and false alarms of `stereokit.check_pair` and of the look of a matcher, on good and on disturbed pairs.
 
 ``python -m stereokit_evaluation.commands.faults --data DIR --output faults.csv`` looks at every pair below `DIR`
 (``kitti2015``, ``kitti2012``, ``eth3d``, ``middlebury``, ``satellite``, ``rendered``; those that are there), and
 disturbs one in `--every` of them, and KITTI 2015's tunnel, frame 000104, in two dozen ways. It prints, for each kind of
 fault, how often it was said of good pairs, and for each disturbance, how often one of the expected faults was said.
-``--quick`` looks at the small copies that `stereokit.Matcher` looks at; ``--match`` matches as well and counts the
-warnings of the matcher.
+``--quick`` looks at the small copies that `stereokit.Matcher` looks at. ``--match METHOD`` matches each pair with a new
+matcher and counts the faults that it tells; ``--alike`` adds good pairs whose views were altered alike: at half size,
+both top to bottom, both darkened with noise on them.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import argparse
 import csv
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit import Matcher
-from stereokit.notices import collecting
+from stereokit.checks import PairWatch
+from stereokit.images.gray import gray_pair
 from stereokit.pairs import KINDS, check_pair
 from stereokit_evaluation.data.datasets import Frame, eth3d, folder, kitti2012, kitti2015, middlebury
 
-__all__ = ["Case", "cases", "good_pairs", "main", "warped"]
+__all__ = ["Case", "altered_alike", "cases", "good_pairs", "main", "matcher_kinds", "warped"]
 
 _SETS = {
     "kitti2015": kitti2015, "kitti2012": kitti2012, "eth3d": eth3d, "middlebury": middlebury, "satellite": folder,
@@ -109,6 +111,27 @@ def cases(left: Gray, right: Gray, other: Gray) -> Iterator[Case]:
         yield case("range begins too late", "range", left, right, int(far) + 2, _MAX_DISPARITY + 64)
 
 
+def altered_alike(left: Gray, right: Gray) -> Iterator[tuple[str, Gray, Gray]]:
+    """Yield the name and the views of good pairs that come of a good pair, when both views are altered alike."""
+    height, width = left.shape
+    size = (width // 2, height // 2)
+    small = [np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.uint8) for view in (left, right)]
+    yield "half size", small[0], small[1]
+    yield "both top to bottom", np.ascontiguousarray(left[::-1]), np.ascontiguousarray(right[::-1])
+    rng = np.random.default_rng(0)
+    dark = [np.clip(view * 0.3 + rng.normal(0, 2, view.shape), 0, 255).astype(np.uint8) for view in (left, right)]
+    yield "both darkened, with noise", dark[0], dark[1]
+
+
+def matcher_kinds(method: str, case: Case) -> set[str]:
+    """Return the kinds of fault that a new matcher tells of a pair."""
+    matcher = Matcher(method, min_disparity=case.min_disparity, max_disparity=case.max_disparity)
+    pair = gray_pair(case.left, case.right)
+    result = matcher.match_gray(pair, matcher.threads)
+    faults = PairWatch(matcher.scale).faults(pair, result, case.min_disparity, case.max_disparity)
+    return {fault.kind for fault in faults}
+
+
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
@@ -117,47 +140,60 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=8)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--match", metavar="METHOD")
+    parser.add_argument("--alike", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     pairs = list(good_pairs(options.data))
-    alarms: Counter[str] = Counter()
-    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     with options.output.open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["pair", "disturbance", "expected", "said", "warned"])
 
-        def look(name: str, case: Case) -> tuple[set[str], int]:
+        def look(name: str, case: Case) -> tuple[set[str], set[str]]:
             levels: dict[str, Any] = {"min_disparity": case.min_disparity, "max_disparity": case.max_disparity}
-            report = check_pair(case.left, case.right, quick=options.quick, **levels)
-            warned = 0
-            if options.match:
-                with collecting() as lines:
-                    Matcher(options.match, **levels)(case.left, case.right)
-                warned = len(lines)
-            said = {fault.kind for fault in report.faults}
-            rows.writerow([name, case.name, " ".join(sorted(case.expected)), " ".join(sorted(said)), warned])
+            said = {fault.kind for fault in check_pair(case.left, case.right, quick=options.quick, **levels).faults}
+            warned = matcher_kinds(options.match, case) if options.match else set[str]()
+            rows.writerow([name, case.name, *(" ".join(sorted(kinds)) for kinds in (case.expected, said, warned))])
             file.flush()
             return said, warned
 
-        warnings = 0
-        for name, left, right in pairs:
-            said, warned = look(name, Case("", frozenset(), left, right))
-            alarms.update(said)
-            warnings += warned
-        print(
-            f"{len(pairs)} good pairs; false alarms:", {kind: alarms[kind] for kind in KINDS}, f"warned of: {warnings}"
-        )
+        _print_alarms(_good_cases(pairs, options.alike), look)
         chosen = [k for k, (name, *_) in enumerate(pairs) if k % options.every == 0 or _TUNNEL in name]
+        counts: dict[str, Counter[str]] = defaultdict(Counter)
         for k in chosen:
             name, left, right = pairs[k]
             for case in cases(left, right, pairs[(k + len(pairs) // 2) % len(pairs)][2]):
                 said, warned = look(name, case)
-                counts[case.name][0] += bool(said & case.expected)
-                counts[case.name][1] += 1
-                counts[case.name][2] += warned > 0
-    print(f"{sum(total for _, total, _ in counts.values())} disturbed pairs:")
-    for case_name, (detected, total, warned) in counts.items():
-        print(f"  {case_name:28s} {detected:3d} of {total:3d} {100 * detected / total:6.1f} %  warned of {warned}")
+                counts[case.name].update(
+                    {"said": bool(said & case.expected), "all": 1, "warned": bool(warned),
+                     "warned so": bool(warned & case.expected)}
+                )  # fmt: skip
+    print(f"{sum(count['all'] for count in counts.values())} disturbed pairs:")
+    for case_name, count in counts.items():
+        matched = f"  warned of {count['warned']:3d}, by its kind {count['warned so']:3d}" if options.match else ""
+        share = f"{count['said']:3d} of {count['all']:3d} {100 * count['said'] / count['all']:6.1f} %"
+        print(f"  {case_name:28s} {share}{matched}")
+
+
+def _good_cases(pairs: list[tuple[str, Gray, Gray]], alike: bool) -> Iterator[tuple[str, Case]]:
+    for name, left, right in pairs:
+        yield name, Case("", frozenset(), left, right)
+        for change, one, two in altered_alike(left, right) if alike else ():
+            levels = _MAX_DISPARITY // 2 if change == "half size" else _MAX_DISPARITY
+            yield f"{name}, {change}", Case("", frozenset(), one, two, 0, levels)
+
+
+def _print_alarms(
+    good: Iterable[tuple[str, Case]], look: Callable[[str, Case], tuple[set[str], set[str]]]
+) -> None:  # fmt: skip
+    """Look at good pairs, and print how many there are and how often each kind of fault was said of them."""
+    total, said, warned = 0, Counter[str](), Counter[str]()
+    for name, case in good:
+        by_check, by_matcher = look(name, case)
+        total += 1
+        said.update(by_check)
+        warned.update(by_matcher)
+    for who, alarms in (("check", said), ("matcher", warned)):
+        print(f"{total} good pairs; false alarms of the {who}:", {kind: alarms[kind] for kind in KINDS})
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ collects its own.
 
 from __future__ import annotations
 
+import logging
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from contextvars import ContextVar
 
 from stereokit.errors import StereokitWarning
 
-__all__ = ["PairWarning", "collecting", "warn"]
+__all__ = ["PairWarning", "collecting", "say", "warn"]
 
 
 class PairWarning(StereokitWarning):
@@ -39,6 +40,18 @@ def warn(message: str, category: type[StereokitWarning] = StereokitWarning) -> N
         warnings.warn(message, category, stacklevel=_outside())
     else:
         handler(message)
+
+
+def say(message: str) -> None:
+    """Tell, in one line, what takes long: to the logger ``stereokit``, as information.
+
+    Where nobody listens to it, an interactive session (a notebook, a prompt) has the line on standard error.
+    """
+    logger = logging.getLogger("stereokit")
+    if logger.isEnabledFor(logging.INFO):
+        logger.info(message)
+    elif hasattr(sys, "ps1") and sys.stderr is not None:
+        print(f"stereokit: {message}", file=sys.stderr, flush=True)
 
 
 @contextmanager

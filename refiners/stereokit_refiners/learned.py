@@ -13,7 +13,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
-import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -423,7 +422,7 @@ def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, 
                 raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {reasons}")
             if wrong:
                 line = f"network {content.network!r} is run by {way[0]} in {way[1]}, since on this machine "
-                warnings.warn(line + "; ".join(wrong), RuntimeWarning, stacklevel=6)
+                warn(line + "; ".join(wrong))
             _sound[key] = way
         return _sound[key]
 

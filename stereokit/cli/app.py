@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import logging
 import os
 import signal
 import sys
@@ -32,7 +33,7 @@ from stereokit.cli.output import version_of
 from stereokit.cli.pair import check
 from stereokit.cli.rig import rig
 from stereokit.cli.warmup import warmup
-from stereokit.errors import StereokitError, one_line
+from stereokit.errors import StereokitError, StereokitWarning, one_line
 from stereokit.notices import collecting
 
 __all__ = ["app", "main"]
@@ -91,7 +92,11 @@ def main() -> None:
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are for programmers
         warnings.filterwarnings("default", module="stereokit")
+        warnings.filterwarnings("default", category=StereokitWarning)
     warnings.showwarning = lambda message, *_, **__: _print_warning(str(message))
+    logger = logging.getLogger("stereokit")
+    logger.addHandler(_Lines())
+    logger.setLevel(logging.INFO)
     with _ending_by_signal():
         try:
             app(prog_name="stereokit")
@@ -171,6 +176,13 @@ def _plugin(entry: metadata.EntryPoint) -> Any:
 def _fail(message: str, error: BaseException) -> None:
     typer.echo(f"error: {one_line(message)}", err=True)
     raise typer.Exit(2) from error
+
+
+class _Lines(logging.Handler):
+    """Prints what the package tells of its work, a line each on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        typer.echo(one_line(record.getMessage()), err=True)
 
 
 def _print_warning(line: str) -> None:

@@ -35,11 +35,12 @@ from stereokit.cli.pair import (
     RightMaskOption,
     StrictOption,
     aligned,
-    read_mask,
+    joined_masks,
+    read_images,
     strictly,
 )
 from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, read_rig_option, rig_files
-from stereokit.errors import InputError, OptionError, UnknownNameError, did_you_mean
+from stereokit.errors import OptionError, UnknownNameError, did_you_mean
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -180,11 +181,8 @@ def match(
     from stereokit.matching import Matcher, compile_kernels
 
     matcher = Matcher(method, **matcher_options, **options)
-    images = io.read_views(left, layout) if right_image is None else io.read_pair(left, right_image, alpha=True)
+    images = read_images(left, right_image, layout)
     height, width = images[0].shape[:2]
-    if images[1].shape[:2] != (height, width):
-        sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
-        raise InputError(f"LEFT and RIGHT must have the same size, got {sizes}")
     camera = _read_camera(calibration, cameras, calibration_scale, width, height)
     masks: dict[str, NDArray[Any]] = {}
     if rig is not None:
@@ -192,10 +190,7 @@ def match(
         images, camera = rectification(*images), rectification.calibration
         masks.update(rectification.masks)
         width, height = rectification.size
-    for name, file in {"mask": mask, "right_mask": right_mask}.items():
-        drawn, seen = read_mask(f"--{name.replace('_', '-')}", file, (height, width)), masks.get(name)
-        if drawn is not None:
-            masks[name] = drawn if seen is None else drawn & seen
+    masks = joined_masks(masks, mask, right_mask, (height, width))
     if align:
         images = images[0], aligned(*images, nodata)
 

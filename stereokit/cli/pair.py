@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereokit.cli.options import JsonOption, MaxDisparityOption, MinDisparityOption, check_json
+from stereokit.cli.options import JsonOption, LayoutOption, MaxDisparityOption, MinDisparityOption, check_json
 from stereokit.cli.output import Table, report, version_of
-from stereokit.errors import InputError
+from stereokit.errors import InputError, OptionError
 from stereokit.notices import PairWarning, collecting, warn
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ __all__ = [
     "StrictOption",
     "aligned",
     "check",
+    "joined_masks",
+    "read_images",
     "read_mask",
     "strictly",
 ]
@@ -36,6 +38,29 @@ RightMaskOption = Annotated[Path | None, typer.Option(metavar="FILE", help="The 
 NodataOption = Annotated[float | None, typer.Option(metavar="VALUE", help="Value of pixels that hold nothing.")]
 StrictOption = Annotated[bool, typer.Option("--strict", help="What would be warned of is an error; writes nothing.")]
 AlignOption = Annotated[bool, typer.Option("--align", help="Align rows that are less than 2 pixels apart first.")]
+
+
+def read_images(left: Path, right: Path | None, layout: str | None) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the images of LEFT and RIGHT, or of one file with both views.
+
+    Raises
+    ------
+    OptionError
+        If there are a layout and two files, or there is no such layout.
+    InputError
+        If the views differ in size.
+    FileError
+        If a file cannot be read.
+    """
+    from stereokit import io
+
+    if layout is not None and right is not None:
+        raise OptionError("--layout is for one file with both views, got LEFT and RIGHT")
+    images = io.read_views(left, layout) if right is None else io.read_pair(left, right, alpha=True)
+    if images[0].shape[:2] != images[1].shape[:2]:
+        sizes = " and ".join(f"{image.shape[1]}x{image.shape[0]}" for image in images)
+        raise InputError(f"LEFT and RIGHT must have the same size, got {sizes}")
+    return images
 
 
 def read_mask(name: str, path: Path | None, shape: tuple[int, int]) -> NDArray[Any] | None:
@@ -58,6 +83,26 @@ def read_mask(name: str, path: Path | None, shape: tuple[int, int]) -> NDArray[A
         sizes = f"{shape[1]}x{shape[0]}, got {usable.shape[1]}x{usable.shape[0]}"
         raise InputError(f"{name} must have the size of the images, {sizes} in {str(path)!r}")
     return usable
+
+
+def joined_masks(
+    masks: dict[str, NDArray[Any]], mask: Path | None, right_mask: Path | None, shape: tuple[int, int]
+) -> dict[str, NDArray[Any]]:  # fmt: skip
+    """Return the masks of a pair, such as those of its rectification, together with those of ``--mask`` files.
+
+    Raises
+    ------
+    InputError
+        If a mask has another size than the images.
+    FileError
+        If a file cannot be read.
+    """
+    total = dict(masks)
+    for name, file in {"mask": mask, "right_mask": right_mask}.items():
+        drawn, seen = read_mask(f"--{name.replace('_', '-')}", file, shape), total.get(name)
+        if drawn is not None:
+            total[name] = drawn if seen is None else drawn & seen
+    return total
 
 
 def aligned(left: Any, right: Any, nodata: float | None) -> Any:
@@ -86,8 +131,9 @@ def strictly(strict: bool) -> Iterator[None]:
 
 
 def check(
-    left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a pair.")],
-    right: Annotated[Path, typer.Argument(metavar="RIGHT", help="Right image, of the same size.")],
+    left: Annotated[Path, typer.Argument(metavar="LEFT", help="Left image of a pair, or one file with both.")],
+    right: Annotated[Path | None, typer.Argument(metavar="[RIGHT]", help="Right image, of the same size.")] = None,
+    layout: LayoutOption = None,
     max_disparity: MaxDisparityOption = 128,
     min_disparity: MinDisparityOption = 0,
     nodata: NodataOption = None,
@@ -98,15 +144,15 @@ def check(
     Says how the rows of the two views lie, which disparities their common points have, and what is wrong. The exit
     status is 1 if the map would suffer from it.
     """
-    from stereokit import io
     from stereokit.pairs import check_pair
 
     check_json(json_file)
-    images = io.read_pair(left, right, alpha=True)
+    images = read_images(left, right, layout)
     quality = check_pair(*images, max_disparity=max_disparity, min_disparity=min_disparity, nodata=nodata)
     values = {name: getattr(quality, name) for name in quality.__dataclass_fields__ if name != "faults"}
     faults = [{"kind": fault.kind, "message": fault.message, "serious": fault.serious} for fault in quality.faults]
-    content = {"left": str(left), "right": str(right), **values, "faults": faults, "version": version_of("stereokit")}
+    content = {"left": str(left), "right": None if right is None else str(right), **values, "faults": faults}
+    content["version"] = version_of("stereokit")
     table = Table("Common points", "Agree", "Row offset", "Roll", "Height", "Disparities", "Brightness", "Sharpness")
     unknown = "unknown"
     table.add_row(

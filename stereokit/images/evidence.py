@@ -6,7 +6,7 @@ far as the cost looks, all pixels are equal: their cost is the same at all dispa
 on the value that they get, and they do not count as measured.
 
 A black border is what rectification leaves where no camera looked: zeros that hang together and reach a side of the
-image, at least `_SMALLEST_BORDER` of them and mostly thick. Of 224 views of streets, rooms and fields none has one.
+image, at least `SMALLEST_BORDER` of them and mostly thick. Of 224 views of streets, rooms and fields none has one.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, shown
 
-__all__ = ["black_border", "blank_pixels", "checked_mask", "joined", "neutral", "unusable"]
+__all__ = ["SMALLEST_BORDER", "THICK", "black_border", "blank_pixels", "checked_mask", "joined", "neutral", "unusable"]
 
-_SMALLEST_BORDER = 64  # pixels
-_THICK = 0.25  # of a border's pixels that have only zeros around them, or are at the side of the image
+SMALLEST_BORDER = 64
+"""Pixels of a black border, at least."""
+THICK = 0.25
+"""Share of a border's pixels that have only zeros around them, or are at the side of the image, at least."""
 
 
 def checked_mask(name: str, mask: Any, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
@@ -88,12 +90,12 @@ def black_border(image: NDArray[Any]) -> NDArray[np.bool_] | None:
     zero = np.ascontiguousarray((colors == 0).all(axis=-1)).view(np.uint8)
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(zero, connectivity=4)
     borders = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    borders = borders[(borders > 0) & (statistics[borders, cv2.CC_STAT_AREA] >= _SMALLEST_BORDER)]
+    borders = borders[(borders > 0) & (statistics[borders, cv2.CC_STAT_AREA] >= SMALLEST_BORDER)]
     if not borders.size:
         return None
     inner = cv2.erode(zero, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     inside = np.bincount(labels[inner > 0], minlength=len(statistics))
-    borders = borders[inside[borders] >= _THICK * statistics[borders, cv2.CC_STAT_AREA]]
+    borders = borders[inside[borders] >= THICK * statistics[borders, cv2.CC_STAT_AREA]]
     if not borders.size or statistics[borders, cv2.CC_STAT_AREA].sum() == zero.size:  # a black image has no border
         return None
     is_border = np.zeros(len(statistics), np.bool_)

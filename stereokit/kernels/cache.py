@@ -15,7 +15,6 @@ import os
 import pickle
 import stat
 import tempfile
-import warnings
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,11 @@ from typing import Any
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 from numba.core.serialize import dumps
 
+from stereokit.notices import say, warn
+
 __all__ = ["cache_of"]
 
-_warned = False
+_warned = _said = False
 
 
 def _warn(message: str) -> None:
@@ -33,7 +34,15 @@ def _warn(message: str) -> None:
     global _warned
     if not _warned:
         _warned = True
-        warnings.warn(f"{message}; NUMBA_CACHE_DIR can name a folder for them", RuntimeWarning, stacklevel=2)
+        warn(f"{message}; NUMBA_CACHE_DIR can name a folder for them")
+
+
+def _say_compiling(place: str) -> None:
+    """Say once in a process that kernels are compiled, which may take many seconds."""
+    global _said
+    if not _said:
+        _said = True
+        say(f"compiling kernels for this processor, 10 to 20 seconds a method, {place}")
 
 
 def _temporary_folder() -> Path | None:
@@ -134,11 +143,14 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled function for a signature, or None."""
         try:
-            return super().load_overload(sig, target_context)
+            code = super().load_overload(sig, target_context)
         except Exception:  # whatever unpickling makes of damaged files
             with suppress(OSError):
                 self.flush()  # an index that can be read, or nothing could be added
-            return None
+            code = None
+        if code is None:
+            _say_compiling(f"once: they are kept in {self.cache_path}")
+        return code
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write the compiled function for a signature."""
@@ -149,10 +161,18 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             _warn(f"compiled kernels cannot be kept ({error})")
 
 
+class _NoCache(NullCache):  # type: ignore[misc]
+    """No cache."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> None:
+        """Return None: nothing is kept."""
+        _say_compiling("in every process")
+
+
 def cache_of(function: Any) -> Any:
     """Return the cache of a kernel: an object of numba's that looks for its compiled code and keeps it."""
     try:
         return _Cache(function)
     except (OSError, RuntimeError):  # numba found no place
         _warn("kernels are compiled again in every process, as no folder for them can be written")
-        return NullCache()
+        return _NoCache()

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.images.evidence import black_border, joined, neutral, unusable
+from stereokit.images.evidence import joined, neutral, unusable
 from stereokit.images.gray import GrayPair, gray_of
 from stereokit.images.intensity import IntensityMapping, find_mapping
 from stereokit.images.resize import reduced, smooth
+from stereokit.large.border import BlackBorder
 from stereokit.large.sources import Source
 
 __all__ = ["BLOCK_NBYTES", "MaskedSource", "Ranges", "find_ranges", "intensity_mapping", "read_pair"]
@@ -37,10 +38,13 @@ class MaskedSource:
     image : Source
     mask : Source or None
         Not 0 where a pixel is usable; None is everywhere.
+    border : BlackBorder or None
+        The black borders of the image; None if it has none.
     """
 
     image: Source
     mask: Source | None = None
+    border: BlackBorder | None = None
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -56,7 +60,8 @@ class MaskedSource:
         """Return a window, and which of its pixels are masked or belong to a black border, None if none do."""
         block = self.image.read(y0, y1, x0, x1)
         usable = None if self.mask is None else self.mask.read(y0, y1, x0, x1) != 0
-        excluded = joined(unusable(usable), black_border(block))
+        border = None if self.border is None else self.border.window(y0, y1, x0, x1)
+        excluded = joined(unusable(usable), border)
         return (block, None) if excluded is None else (neutral(block, ~excluded), excluded)
 
 

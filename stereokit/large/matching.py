@@ -25,6 +25,7 @@ from stereokit.images.gray import check_same
 from stereokit.images.intensity import IntensityMapping
 from stereokit.io.images import check_orientations
 from stereokit.large.bands import BandAssembler
+from stereokit.large.border import find_border
 from stereokit.large.intensity import BLOCK_NBYTES, MaskedSource, Ranges, find_ranges, intensity_mapping
 from stereokit.large.memory import free_nbytes, parse_memory, resident_nbytes
 from stereokit.large.output import check_large_output, write_bands
@@ -158,10 +159,9 @@ def match_large(
     check_same(*sources)
     check_orientations(sources[0].orientation, sources[1].orientation)
     height, width = sources[0].shape[:2]
-    views = (
-        MaskedSource(sources[0], _mask_source("mask", mask, (height, width))),
-        MaskedSource(sources[1], _mask_source("right_mask", right_mask, (height, width))),
-    )
+    masks = _mask_source("mask", mask, (height, width)), _mask_source("right_mask", right_mask, (height, width))
+    borders = [find_border(source, BLOCK_NBYTES) for source in sources]
+    views = MaskedSource(sources[0], masks[0], borders[0]), MaskedSource(sources[1], masks[1], borders[1])
     mapping = intensity_mapping(*views, matcher.settings.nodata)
     windows = _plan(matcher, views, mapping, overlap, limit, target)
     ranges: Ranges | None = None
@@ -202,6 +202,7 @@ def _plan(
     size = mapping.kind.itemsize
     has_masks = (
         bool(masks)
+        or any(view.border is not None for view in views)
         or mapping.nodata is not None
         or sources[0].dtype != np.uint8
         or any(source.shape[2:] == (4,) for source in sources)

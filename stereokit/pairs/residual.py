@@ -25,66 +25,72 @@ _MARGIN = _HALF + 1
 _SIDE = 2 * _MARGIN + 1
 _SLOPE = 2.0  # grey levels of 256 a pixel that a point must have
 _BINS = 512  # of slopes: half a grey level each
+_STILL = 0.25  # pixels of disparity
 _REGULAR = 0.02  # of the determinant, to the square of the slopes down, where both directions can be told
 
 
 def row_residual(pair: GrayPair, disparity: NDArray[np.float32], valid: NDArray[np.bool_]) -> float | None:
-    """Return how much lower the right view shows what the map says is the same, pixels; None if too little tells.
-
-    Parameters
-    ----------
-    pair : GrayPair
-    disparity : (H, W) float32
-        The left view's map, pixels.
-    valid : (H, W) bool
-        Where it was measured.
-    """
-    height, width = disparity.shape
-    if min(height, width) <= 4 * _MARGIN:
+    points = measure(pair, disparity, valid, 0, 128)[0]
+    if points.shape[1] < _FEWEST:
         return None
+    known = ~np.isnan(points[2])
+    values = np.sort(points[2, known] if np.count_nonzero(known) >= _FEWEST else points[3])
+    return float(values[(values.size - 1) // 2] + values[values.size // 2]) / 2
+
+
+def measure(pair, disparity, valid, low, high):
+    height, width = disparity.shape
     step = max(1, int(math.sqrt(height * width / _CANDIDATES)))
     scale = 1.0 if pair.left.dtype == np.uint8 else 255 / max(pair.span[1] - pair.span[0], 1)
-    shifts = np.empty((2, _POINTS), np.float32)
+    points = np.empty((4, _POINTS), np.float32)
     counts = np.zeros(_BINS, np.int32)
     windows = np.empty((2, _SIDE * _SIDE), np.float32)
     grid = -(-(height - 2 * _MARGIN) // step) * -(-(width - 2 * _MARGIN) // step)
     slopes = np.empty(grid, np.int16)
-    count, regular = _row_shifts(pair.left, pair.right, disparity, valid, step, scale, slopes, counts, windows, shifts)
-    if count < _FEWEST:
-        return None
-    values = np.sort(shifts[0, :regular] if regular >= _FEWEST else shifts[1, :count])
-    return float(values[(values.size - 1) // 2] + values[values.size // 2]) / 2
+    count, *shares = _row_shifts(
+        pair.left, pair.right, disparity, valid, step, scale, (low + 1.5, high - 2.5), slopes, counts, windows, points
+    )
+    return points[:, :count], shares
 
 
 @kernel
 def _row_shifts(
     left: NDArray[Any], right: NDArray[Any], disparity: NDArray[np.float32], valid: NDArray[np.bool_], step: int,
-    scale: float, slopes: NDArray[np.int16], counts: NDArray[np.int32], windows: NDArray[np.float32],
-    shifts: NDArray[np.float32],
-) -> tuple[int, int]:  # fmt: skip
-    """Measure shifts at the points of a grid of `step` that have the steepest slopes; return how many of either kind.
+    scale: float, ends: tuple[float, float], slopes: NDArray[np.int16], counts: NDArray[np.int32],
+    windows: NDArray[np.float32], points: NDArray[np.float32],
+) -> tuple[int, int, int, int, int]:  # fmt: skip
+    """Measure shifts at the points of a grid of `step` that have the steepest slopes.
 
-    `slopes` has one element per point of the grid; `counts`, zeros, one per bin of slopes; `windows` room for two.
-    Row 0 of `shifts` takes those of points where both directions can be told, row 1 all, by the slope down alone.
+    `slopes` has one element per point of the grid; `counts`, zeros, one per bin of slopes; `windows` room for two. The
+    rows of `points` take, of each point, its y and x, the shift by both directions (NaN where only one can be told),
+    and the shift by the slope down alone. Returned are the number of points, and, of the grid, how many were measured,
+    lie below and above `ends` of disparity, and are still.
     """
     height, width = disparity.shape
-    k = 0
+    k, measured, below, above, still = 0, 0, 0, 0, 0
     for y in range(_MARGIN, height - _MARGIN, step):
         for x in range(_MARGIN, width - _MARGIN, step):
-            place = np.float32(x) - disparity[y, x]
             slopes[k] = -1
-            if valid[y, x] and place >= _MARGIN and place < width - _MARGIN - 1:
+            k += 1
+            if not valid[y, x]:
+                continue
+            d = disparity[y, x]
+            measured += 1
+            below += d < ends[0]
+            above += d > ends[1]
+            still += abs(d) < _STILL
+            place = np.float32(x) - d
+            if place >= _MARGIN and place < width - _MARGIN - 1:
                 slope = abs(np.float64(left[y + 1, x]) - np.float64(left[y - 1, x])) * scale
                 if slope > 2 * _SLOPE:
-                    slopes[k] = np.int16(min(slope, _BINS - 1.0))
-                    counts[slopes[k]] += 1
-            k += 1
+                    slopes[k - 1] = np.int16(min(slope, _BINS - 1.0))
+                    counts[slopes[k - 1]] += 1
     least, steeper = _BINS - 1, 0  # points of at least this slope, and of more than it
-    while least > 0 and steeper + counts[least] < shifts.shape[1]:
+    while least > 0 and steeper + counts[least] < points.shape[1]:
         steeper += counts[least]
         least -= 1
-    rest = shifts.shape[1] - steeper  # of the points of just this slope
-    k, count, regular = 0, 0, 0
+    rest = points.shape[1] - steeper  # of the points of just this slope
+    k, count = 0, 0
     for y in range(_MARGIN, height - _MARGIN, step):
         for x in range(_MARGIN, width - _MARGIN, step):
             slope_bin = slopes[k]
@@ -129,9 +135,11 @@ def _row_shifts(
             determinant = yy * xx - xy * xy
             if yy <= 0:
                 continue
-            shifts[1, count] = yt / yy
-            count += 1
+            points[0, count] = y
+            points[1, count] = x
+            points[2, count] = np.nan
             if determinant > _REGULAR * yy * yy:
-                shifts[0, regular] = (xx * yt - xy * xt) / determinant
-                regular += 1
-    return count, regular
+                points[2, count] = (xx * yt - xy * xt) / determinant
+            points[3, count] = yt / yy
+            count += 1
+    return count, measured, below, above, still

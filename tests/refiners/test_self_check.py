@@ -17,7 +17,7 @@ from refining import (
     tuned_to_kitti,
 )
 
-from stereokit.errors import StereokitError
+from stereokit.errors import StereokitError, StereokitWarning
 from stereokit_refiners import learned
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.runtimes import reference
@@ -93,7 +93,7 @@ def test_a_wrong_runtime_gives_way_to_another_with_one_warning(broken):
     rule = (
         rf"^network 'cnn' is run by {second} in fp32, since on this machine {first} in fp32 is off by 2 px on average$"
     )
-    with pytest.warns(RuntimeWarning, match=rule) as messages:
+    with pytest.warns(StereokitWarning, match=rule) as messages:
         refiner, actual = refined(first)
     assert len(messages) == 1
     np.testing.assert_array_equal(actual, expected)
@@ -108,7 +108,7 @@ def test_a_wrong_precision_gives_way_to_fp32_of_the_same_runtime(broken):
     expected = refined("openvino")[1]
     broken("openvino bf16")
     with pytest.warns(
-        RuntimeWarning, match="is run by openvino in fp32, since on this machine openvino in bf16 is off"
+        StereokitWarning, match="is run by openvino in fp32, since on this machine openvino in bf16 is off"
     ):
         refiner, actual = refined("openvino", precision="bf16")
     np.testing.assert_array_equal(actual, expected)

@@ -17,6 +17,7 @@ import pytest
 
 import stereokit
 import stereokit_refiners
+from stereokit.errors import StereokitWarning
 from stereokit.kernels import cache
 from stereokit.kernels.jit import kernel_sources
 
@@ -31,7 +32,8 @@ USE = """
         filled = fill(np.array([[np.nan, 3, np.nan]], np.float32))
         full = Direct().map(np.full((1, 1, 4), 0.5, np.float32), np.zeros((1, 1), np.float32), 2, 2)
     assert filled.tolist() == [[3, 3, 3]] and full.tolist() == [[128, 128]] * 2
-    print(stereokit.__file__, [str(w.message) for w in caught if w.category is RuntimeWarning], sep="\\n")
+    lines = [str(w.message) for w in caught if issubclass(w.category, stereokit.StereokitWarning)]
+    print(stereokit.__file__, lines, sep="\\n")
     """
 
 
@@ -150,7 +152,7 @@ def test_a_cache_that_cannot_be_written_any_more_is_warned_of_once(kernels, monk
 
     monkeypatch.setattr("numba.core.caching.IndexDataCacheFile._save_data", full)
     monkeypatch.setattr(cache, "_warned", False)
-    with pytest.warns(RuntimeWarning, match=r"No space left.*NUMBA_CACHE_DIR"):
+    with pytest.warns(StereokitWarning, match=r"No space left.*NUMBA_CACHE_DIR"):
         double(kernels())
     double(kernels())  # a second warning would be an error
 
@@ -164,7 +166,7 @@ def test_a_cache_that_can_only_be_read_is_read(kernels, monkeypatch):
     monkeypatch.setattr("tempfile.TemporaryFile", read_only)  # with which numba and we look whether we may write
     monkeypatch.setattr(cache, "_warned", False)
     assert double(kernels())
-    with pytest.warns(RuntimeWarning, match="Permission denied"):  # what is not there cannot be kept
+    with pytest.warns(StereokitWarning, match="Permission denied"):  # what is not there cannot be kept
         assert not double(kernels(), np.float64)
 
 

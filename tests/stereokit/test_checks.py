@@ -14,7 +14,7 @@ from stereokit.checks import PairWatch, density_fault, min_density, same_pixels
 from stereokit.checks import check_gray as check
 from stereokit.errors import StereokitWarning
 from stereokit.images.gray import gray_pair
-from stereokit.notices import PairWarning, collecting, warn
+from stereokit.notices import PairWarning, collecting, say, warn
 from stereokit.result import Disparity
 
 NOISE = cv2.GaussianBlur(np.random.default_rng(0).normal(128, 90, (60, 700)), (0, 0), 0.8)
@@ -145,3 +145,15 @@ def test_warnings_go_to_who_collects_in_this_thread():
     assert (outer, inner) == (["one", "three"], ["two"])
     assert [(str(w.message), w.category) for w in caught] == [("of another thread", StereokitWarning)]
     assert stereokit.PairWarning is PairWarning and issubclass(PairWarning, stereokit.StereokitWarning)
+
+
+def test_what_takes_long_is_told_to_a_logger_or_a_prompt(monkeypatch, caplog, capsys):
+    say("one")
+    with caplog.at_level("INFO", "stereokit"):
+        say("two")
+    monkeypatch.setattr("sys.ps1", ">>> ", raising=False)
+    say("three")
+    with caplog.at_level("INFO", "stereokit"):
+        say("four")
+    assert [record.getMessage() for record in caplog.records] == ["two", "four"]
+    assert capsys.readouterr().err == "stereokit: three\n"

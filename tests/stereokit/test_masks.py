@@ -13,6 +13,8 @@ from stereokit import Matcher
 from stereokit.errors import InputError
 from stereokit.images.evidence import black_border, blank_pixels
 from stereokit.io import read_image, read_pair, write_image
+from stereokit.large.border import find_border
+from stereokit.large.sources import open_source
 from stereokit.notices import collecting
 
 HEIGHT, WIDTH, DISPARITY = 60, 160, 7
@@ -148,6 +150,50 @@ def test_match_large_honours_masks_and_borders(method, fill, tmp_path):
         for pair, masks in cases.values():
             stereokit.match_large(*pair, tmp_path / "map.npy", method, fill=fill, **OPTIONS, **masks)
             np.testing.assert_array_equal(np.load(tmp_path / "map.npy"), expected)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 7, 40, 100])
+def test_borders_of_blocks_are_those_of_the_image(rows):
+    """Of wedges, frames, blobs and sprinkles of zeros, in one to forty blocks: those that the whole image has."""
+    rng = np.random.default_rng(rows)
+    kinds = set()
+    for number in range(40):
+        height, width = (int(size) for size in rng.integers(1, 41, 2))
+        image = rng.integers(1, 256, (height, width), np.uint8)
+        y, x = np.mgrid[:height, :width]
+        for _ in range(rng.integers(0, 5)):
+            a, b, c = rng.normal(0, 1, 3)
+            image[a * y + b * x > (abs(a) * height + abs(b) * width) * (0.5 + 0.3 * c)] = 0
+        image[rng.random(image.shape) < rng.choice([0, 0.1, 0.6])] = rng.choice([0, 9])
+        if number % 3 == 0:
+            image = np.dstack([image, image, rng.choice([0, 1]) * image])
+        expected = black_border(image)
+        border = find_border(open_source("left", image), rows * image[:1].nbytes)
+        kinds.add((expected is None, rows < height))
+        if expected is None:
+            assert border is None
+            continue
+        for _ in range(4):
+            y0, x0 = int(rng.integers(0, height)), int(rng.integers(0, width))
+            y1, x1 = int(rng.integers(y0, height)) + 1, int(rng.integers(x0, width)) + 1
+            part = border.window(y0, y1, x0, x1)
+            np.testing.assert_array_equal(np.zeros((y1 - y0, x1 - x0), bool) if part is None else part,
+                                          expected[y0:y1, x0:x1])  # fmt: skip
+    assert {(True, rows < 40), (False, rows < 40)} <= kinds
+
+
+def test_a_black_object_is_no_border_in_a_window(tmp_path, monkeypatch):
+    """Blocks of few rows cut through a black square inside the image and through thin parts of a wedge."""
+    left, right = wedges(0.1)
+    pair = [blackened(view, usable) for view, usable in ((LEFT, left), (RIGHT, right))]
+    pair[0][20:45, 60:100] = 0
+    monkeypatch.setattr("stereokit.large.intensity.BLOCK_NBYTES", 5 * WIDTH)
+    monkeypatch.setattr("stereokit.large.matching.BLOCK_NBYTES", 5 * WIDTH)
+    with collecting():
+        expected = stereokit.match(*pair, **OPTIONS)
+        stereokit.match_large(*pair, tmp_path / "map.npy", **OPTIONS)
+    assert np.isfinite(expected[20:45, 60:100]).all() and np.isnan(expected[~left]).all()
+    np.testing.assert_array_equal(np.load(tmp_path / "map.npy"), expected)
 
 
 def test_transparent_pixels_are_masked(tmp_path):

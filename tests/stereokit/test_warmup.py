@@ -16,25 +16,28 @@ from stereokit.cli.app import app
 
 
 def run(cache, *arguments):
-    """Run the command line as a new process with a folder of compiled kernels; return its lines."""
+    """Run the command line as a new process with a folder of compiled kernels; return its lines, and those beside."""
     done = subprocess.run(
         [sys.executable, "-m", "stereokit.cli", *map(str, arguments)],
         env={**os.environ, "NUMBA_CACHE_DIR": str(cache)}, capture_output=True, text=True, timeout=900, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
+    return done.stdout.splitlines(), done.stderr.splitlines()
 
 
 def test_a_later_match_compiles_nothing(tmp_path):
     cache = tmp_path / "cache"
-    (line,) = run(cache, "warmup", "S2", "--max-disparity", 16)
+    (line,), (word,) = run(cache, "warmup", "S2", "--max-disparity", 16)
     assert re.fullmatch(r"S2: \d+\.\d s", line)
+    assert word.startswith("compiling kernels") and str(cache) in word  # said once, though there is no terminal
     compiled = {path: path.stat().st_mtime_ns for path in cache.rglob("*.nb?")}
     assert len(compiled) > 5
     image = np.random.default_rng(0).integers(0, 256, (123, 177), np.uint8)  # large enough for speckles
     for name in ("left.png", "right.png"):
         cv2.imwrite(str(tmp_path / name), image)
-    run(cache, "match", tmp_path / "left.png", tmp_path / "right.png", "-o", tmp_path / "m.pfm", "--max-disparity", 16)
+    pair = tmp_path / "left.png", tmp_path / "right.png"
+    _, beside = run(cache, "match", *pair, "-o", tmp_path / "m.pfm", "--max-disparity", 16)
+    assert not any("compiling" in line for line in beside)
     assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.nb?")} == compiled
 
 

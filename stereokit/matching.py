@@ -28,7 +28,7 @@ from stereokit.kernels.threads import Job, Workers, available_threads
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit.options import MatchOptions, StageOptions, WarmupOptions
-from stereokit.pairs.residual import row_residual
+from stereokit.pairs.signs import map_signs
 from stereokit.pipeline import CpuPipeline, Pipeline, concluded, with_blank
 from stereokit.result import Disparity
 from stereokit.settings import MatchSettings
@@ -498,7 +498,8 @@ def compile_kernels(matcher: Matcher, shape: tuple[int, ...] = (), dtype: Any = 
     image[:, ::2] = 1
     with collecting():
         matcher(image, image)
-        row_residual(gray_pair(image, image), np.zeros((side, side), np.float32), np.ones((side, side), np.bool_))
+        everywhere = np.ones((side, side), np.bool_)
+        map_signs(gray_pair(image, image), np.zeros((side, side), np.float32), everywhere, 0, 1)  # for `PairWatch`
 
 
 def _forget_matchers() -> None:

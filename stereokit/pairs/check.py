@@ -181,8 +181,8 @@ def check_gray(pair: GrayPair, min_disparity: int, max_disparity: int, *, quick:
     side = _QUICK_SIDE if quick else _SIDE
     left, factor = stretched(pair.left, side)
     right, _ = stretched(pair.right, side)
-    mine = points_of(left, factor, _usable(pair.left_bad, left.shape))
-    theirs = points_of(right, factor, _usable(pair.right_bad, right.shape))
+    usable = _usable(pair.left_bad, left.shape), _usable(pair.right_bad, right.shape)
+    mine, theirs = points_of(left, factor, usable[0]), points_of(right, factor, usable[1])
     matches = match_points(mine, theirs)
     rows = fit_rows(matches, height, width, _TOLERANCE / factor)
     known = rows if rows is not None and rows.share >= _MAJORITY else None

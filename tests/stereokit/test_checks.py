@@ -15,6 +15,7 @@ from stereokit.checks import check_gray as check
 from stereokit.errors import StereokitWarning
 from stereokit.images.gray import gray_pair
 from stereokit.notices import PairWarning, collecting, say, warn
+from stereokit.pairs.signs import MapSigns
 from stereokit.result import Disparity
 
 NOISE = cv2.GaussianBlur(np.random.default_rng(0).normal(128, 90, (60, 700)), (0, 0), 0.8)
@@ -110,7 +111,8 @@ def test_density_decides():
 def test_rows_of_small_pairs_are_looked_at_now_and_then(shape, levels, scale, due, monkeypatch):
     """A look costs a quarter of a millisecond: it is due after 6 million cells of matching, and at the first pair."""
     looks = []
-    monkeypatch.setattr("stereokit.checks.row_residual", lambda *_: looks.append(1))
+    signs = MapSigns(None, 0.0, 0.0, 0.0, 0.0, 0.0)
+    monkeypatch.setattr("stereokit.checks.map_signs", lambda *_: looks.append(1) or signs)
     rng = np.random.default_rng(0)
     pair = gray_pair(*(rng.integers(0, 256, shape, np.uint8) for _ in range(2)))
     watch, counts = PairWatch(scale), []

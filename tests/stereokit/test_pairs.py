@@ -12,14 +12,16 @@ from typer.testing import CliRunner
 
 import stereokit
 from stereokit import align_rows, check_pair
+from stereokit.checks import PairWatch
 from stereokit.cli.app import app
 from stereokit.errors import InputError, OptionError
 from stereokit.images.gray import gray_pair
 from stereokit.io import write_image
 from stereokit.pairs import KINDS
 from stereokit.pairs.features import Matches
-from stereokit.pairs.residual import row_residual
 from stereokit.pairs.rows import fit_rows
+from stereokit.pairs.signs import map_signs
+from stereokit.result import Disparity
 
 HEIGHT, WIDTH = 240, 400
 
@@ -176,19 +178,23 @@ def test_rows_are_fitted_exactly_and_outliers_left():
     assert fit_rows(Matches(left[:1].repeat(20, 0), left[:1].repeat(20, 0), np.zeros(20)), 400, 600, 0.5) is None
 
 
+def offset_of(pair, disparity, valid):
+    return map_signs(pair, disparity, valid, 0, 64).offset
+
+
 @pytest.mark.parametrize("offset", [-0.3, -0.1, 0.0, 0.2, 0.3])
 def test_rows_are_measured_without_features(offset):
     left, right = scene(offset=offset)
     truth = np.broadcast_to(8 + 32 * np.arange(HEIGHT, dtype=np.float32)[:, None] / HEIGHT, left.shape)
     valid = np.arange(WIDTH)[None, :] > 50 + 0 * truth
-    assert row_residual(gray_pair(left, right), truth, valid) == pytest.approx(offset, abs=0.12)
+    assert offset_of(gray_pair(left, right), truth, valid) == pytest.approx(offset, abs=0.12)
     pair = gray_pair(left.astype(np.float32) * 9.5, right.astype(np.float32) * 9.5)
-    assert row_residual(pair, truth, valid) == pytest.approx(offset, abs=0.12)
-    further = row_residual(gray_pair(*scene(offset=1 if offset > 0 else -1)), truth, valid)
+    assert offset_of(pair, truth, valid) == pytest.approx(offset, abs=0.12)
+    further = offset_of(gray_pair(*scene(offset=1 if offset > 0 else -1)), truth, valid)
     assert abs(further) > 0.4 and (further > 0) == (offset > 0)
-    assert row_residual(gray_pair(left, right), truth, np.zeros_like(valid)) is None
+    assert offset_of(gray_pair(left, right), truth, np.zeros_like(valid)) is None
     tiny = np.zeros((8, 9), np.uint8)
-    assert row_residual(gray_pair(tiny, tiny), np.zeros((8, 9), np.float32), np.ones((8, 9), bool)) is None
+    assert offset_of(gray_pair(tiny, tiny), np.zeros((8, 9), np.float32), np.ones((8, 9), bool)) is None
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -210,14 +216,38 @@ def test_the_rows_of_few_points_are_those_of_the_oracle(dtype, stripes):
     regular = [shift for shift, is_regular in shifts if is_regular]
     assert len(shifts) == 200 and (len(regular) < 30) == stripes
     expected = np.median(regular if not stripes else [shift for shift, _ in shifts])
-    assert row_residual(pair, disparity, valid) == pytest.approx(expected, abs=1e-4) and abs(expected) > 0.1
+    assert offset_of(pair, disparity, valid) == pytest.approx(expected, abs=1e-4) and abs(expected) > 0.1
     few = valid & (np.arange(90) < 12)
     few[:, :9] = False
     shifts = oracles.row_shifts(pair.left, pair.right, disparity, few, scale)
-    told = row_residual(pair, disparity, few)
+    told = offset_of(pair, disparity, few)
     assert 30 <= len(shifts) < 200 and told == pytest.approx(
         np.median([shift for shift, is_regular in shifts if is_regular or stripes]), abs=1e-4
     )
+
+
+def test_a_turned_view_shows_in_the_halves_of_the_map():
+    truth = np.broadcast_to(8 + 32 * np.arange(HEIGHT, dtype=np.float32)[:, None] / HEIGHT, (HEIGHT, WIDTH))
+    valid = np.arange(WIDTH)[None, :] > 50 + 0 * truth
+    straight, turned = (
+        map_signs(gray_pair(*scene(roll=roll)), np.ascontiguousarray(truth), valid, 0, 64) for roll in (0.0, 0.1)
+    )
+    assert straight.tilt < 0.1 and straight.spread < 0.1
+    apart = np.tan(np.radians(0.1)) * (WIDTH - 50) / 2  # of the middles of the halves
+    assert turned.tilt == pytest.approx(apart, abs=0.12) and abs(turned.offset) < 0.15
+
+
+def test_shares_at_the_ends_of_the_range_and_at_zero():
+    values = np.array([-0.2, 0.2, 5, 9, 9.4, 9.6, 30, 61.4, 61.6, 63], np.float32)
+    disparity = np.ascontiguousarray(np.broadcast_to(np.repeat(values, 20), (50, 200)))
+    pair = gray_pair(*(np.full((50, 200), value, np.uint8) for value in (9, 10)))
+    valid = np.ones(disparity.shape, bool)
+    valid[:, :20] = False  # -0.2
+    signs = map_signs(pair, disparity, valid, 8, 64)
+    assert signs.offset is None and (signs.spread, signs.tilt) == (0, 0)
+    assert (signs.low, signs.high, signs.still) == pytest.approx((4 / 9, 2 / 9, 1 / 9), abs=0.03)
+    empty = map_signs(pair, disparity, np.zeros_like(valid), 8, 64)
+    assert (empty.low, empty.high, empty.still) == (0, 0, 0)
 
 
 @pytest.mark.parametrize(("offset", "roll"), [(1.0, 0.0), (-1.3, 0.0), (0.5, 0.3)])
@@ -241,6 +271,45 @@ def test_what_is_not_aligned():
     ):
         with pytest.raises(InputError, match=words):
             align_rows(*pair)
+
+
+@pytest.mark.parametrize(
+    ("kind", "views", "levels"),
+    [
+        ("rows", scene(roll=0.4), (0, 64)),
+        ("same", (scene()[0], cv2.GaussianBlur(scene()[0], (0, 0), 0.5)), (0, 64)),
+        ("range", scene(), (0, 32)),
+        ("range", scene(), (20, 84)),
+    ],
+)
+def test_dense_maps_of_bad_pairs_have_signs(kind, views, levels):
+    """Nothing is wrong with their density, nor with the median of their rows."""
+    low, high = levels
+    matcher = stereokit.Matcher("S2", min_disparity=low, max_disparity=high)
+    pair = gray_pair(*views)
+    result = matcher.match_gray(pair, 1)
+    assert result.density > 0.5
+    assert [fault.kind for fault in PairWatch().faults(pair, result, low, high)] == [kind]
+
+
+def test_why_a_density_is_low():
+    """The reason comes first; a pair that looks right is told of where hardly anything was measured."""
+    left, right = scene()
+    pair, blurred = gray_pair(left, right), gray_pair(cv2.GaussianBlur(left, (0, 0), 3), right)
+    valid = np.random.default_rng(0).random(left.shape)
+    for views, share, words in (
+        (blurred, 0.2, "only 20 % of the pixels could be measured: the left view is the less sharp one"),
+        (pair, 0.05, "only 5.0 % of the pixels could be measured, though rows and range look right"),
+        (pair, 0.2, None),
+    ):
+        result = Disparity(np.zeros(left.shape, np.float32), valid < share)
+        watch = PairWatch()
+        for _ in range(4):  # the third time it is not looked at closely
+            faults = watch.faults(views, result, 0, 64)
+            assert [fault.message.startswith(words) for fault in faults if words] == ([True] if words else [])
+            assert words is not None or faults == []
+            if views is blurred:
+                break
 
 
 def test_a_matcher_warns_with_the_remedy():

@@ -20,11 +20,11 @@ import threading
 import numpy as np
 
 from stereokit.images.gray import GrayPair
-from stereokit.pairs.check import Fault, check_gray, same_pixels
+from stereokit.pairs.check import Fault, check_gray, same_pixels, unusable_fault
 from stereokit.pairs.signs import MapSigns, map_signs
 from stereokit.result import Disparity
 
-__all__ = ["PairWatch", "density_fault", "min_density", "same_fault", "same_pixels", "unusable_fault"]
+__all__ = ["PairWatch", "density_fault", "min_density", "same_fault", "same_pixels"]
 
 _MIN_DENSITY, _DENSITY_PER_HALVING, _MAX_MIN_DENSITY = 0.3, 0.05, 0.45
 """Density below which a map of 128 levels gets a warning; the increase per halving of the levels; and its bound."""
@@ -98,7 +98,7 @@ class PairWatch:
             if not self._looked_right:
                 return [low]
             hint = "rows and range look right: is there too little light or texture?"
-            return [Fault("density", f"{_shown(density)}, though {hint}")] if density < _HARDLY_ANY else []
+            return [Fault("sparse", f"{_shown(density)}, though {hint}")] if density < _HARDLY_ANY else []
         offset = None if signs is None else signs.offset
         if offset is None or abs(offset) <= _VERY_FAR_ROWS:
             return []
@@ -122,11 +122,6 @@ def min_density(levels: int) -> float:
 def same_fault() -> Fault:
     """Return the fault of a pair whose views have equal pixels."""
     return Fault("same", "left and right hold the same pixels: was one view given twice?")
-
-
-def unusable_fault() -> Fault:
-    """Return the fault of a pair without any usable pixel."""
-    return Fault("unusable", "no pixel is usable: mask, no-data value, alpha or black borders exclude them all")
 
 
 def density_fault(density: float, min_disparity: int, max_disparity: int) -> Fault | None:

@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.checks import PairWatch, density_fault, same_fault, same_pixels, unusable_fault
+from stereokit.checks import PairWatch, density_fault, same_fault, same_pixels
 from stereokit.images.evidence import joined
 from stereokit.images.intensity import IntensityMapping
 from stereokit.large.intensity import MaskedSource, Ranges, read_pair
 from stereokit.large.plan import Plan, Span
 from stereokit.matching import Matcher
-from stereokit.pairs.check import Fault
+from stereokit.pairs.check import Fault, unusable_fault
 from stereokit.pipeline import with_blank
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows
 
 __all__ = ["BandAssembler"]
 
-_OF_WINDOWS = frozenset(("density", "unusable", "same"))
+_OF_WINDOWS = frozenset(("density", "sparse", "unusable", "same"))
 """Kinds of fault that a window alone, of nothing but water, may have."""
 
 
@@ -119,10 +119,10 @@ class BandAssembler:
         return [fault.message for fault in self._final_faults()]
 
     def _final_faults(self) -> list[Fault]:
-        if self.views_equal:
-            return [same_fault()]
         if not self._usable:
             return [unusable_fault()]
+        if self.views_equal:
+            return [same_fault()]
         low = density_fault(self.measured / self._usable, *self._range)
         closer = [fault for fault in self._faults if fault.kind not in _OF_WINDOWS]
         if low is not None:

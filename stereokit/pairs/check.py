@@ -21,7 +21,7 @@ from stereokit.images.gray import GrayPair, gray_pair
 from stereokit.pairs.features import Matches, Points, match_points, points_of, stretched
 from stereokit.pairs.rows import FEWEST, Rows, fit_rows
 
-__all__ = ["KINDS", "Fault", "PairReport", "check_gray", "check_pair", "same_pixels"]
+__all__ = ["KINDS", "Fault", "PairReport", "check_gray", "check_pair", "same_pixels", "unusable_fault"]
 
 KINDS = {
     "same": "one view was given twice",
@@ -33,12 +33,13 @@ KINDS = {
     "unrelated": "the views do not show the same scene",
     "density": "few pixels could be measured",
     "unusable": "no pixel may be matched",
+    "sparse": "hardly anything could be measured, although the pair looks right",
     "exposure": "the views differ in brightness",
     "sharpness": "the views differ in sharpness",
     "blank": "much of the left view has no texture",
     "saturated": "much of the left view is white",
 }
-"""What can be wrong with a pair, the worst first; up to "unusable" the map suffers. "density" and "unusable" are what
+"""What can be wrong with a pair, the worst first; up to "unusable" the map suffers. "density" and "sparse" are what
 matchers say, who have a map."""
 
 SERIOUS = frozenset(list(KINDS)[: list(KINDS).index("unusable") + 1])
@@ -178,6 +179,8 @@ def check_pair(
 def check_gray(pair: GrayPair, min_disparity: int, max_disparity: int, *, quick: bool = False) -> PairReport:
     """Look at a pair that was checked and is grey; see `check_pair`."""
     height, width = pair.left.shape
+    if any(bad is not None and bad.all() for bad in (pair.left_bad, pair.right_bad)):
+        return PairReport(width, height, 0, 0.0, faults=(unusable_fault(),))
     side = _QUICK_SIDE if quick else _SIDE
     left, factor = stretched(pair.left, side)
     right, _ = stretched(pair.right, side)
@@ -199,7 +202,7 @@ def check_gray(pair: GrayPair, min_disparity: int, max_disparity: int, *, quick:
             faults = _of_rows(known, height, width)
             if abs(known.roll_degrees) < _LARGE_ROLL:
                 faults += _of_disparities(matches, known, min_disparity, max_disparity)
-    blank, white = _blank(left), _saturated(pair.left)
+    blank, white = _blank(left, usable[0]), _saturated(pair.left, pair.left_bad)
     sharpness = _sharpness(right) / _sharpness(left)
     if known is None and faults and not 1 / _BLURRED < sharpness < _BLURRED:
         faults = []  # features of so different views tell nothing
@@ -218,6 +221,11 @@ def check_gray(pair: GrayPair, min_disparity: int, max_disparity: int, *, quick:
         width, height, len(matches.turns), 0.0 if rows is None else rows.share, **seen, brightness=brightness,
         sharpness=sharpness, blank=blank, saturated=white, faults=tuple(faults),
     )  # fmt: skip
+
+
+def unusable_fault() -> Fault:
+    """Return the fault of a pair without any usable pixel."""
+    return Fault("unusable", "no pixel is usable: mask, no-data value, alpha or black borders exclude them all")
 
 
 def same_pixels(left: Any, right: Any) -> bool:
@@ -376,15 +384,18 @@ def _sharpness(image: NDArray[np.uint8]) -> float:
     return float(np.square(cv2.Laplacian(soft, cv2.CV_32F)).mean()) / max(slopes, 1e-6) + 1e-6
 
 
-def _blank(image: NDArray[np.uint8]) -> float:
-    """Return the share of pixels whose neighbourhood has one value."""
+def _blank(image: NDArray[np.uint8], usable: NDArray[np.bool_] | None) -> float:
+    """Return the share of the usable pixels whose neighbourhood has one value."""
     square = np.ones((7, 7), np.uint8)
-    return float(np.mean(cv2.dilate(image, square) == cv2.erode(image, square)))
+    blank = np.asarray(cv2.dilate(image, square) == cv2.erode(image, square))
+    return float(np.mean(blank if usable is None or not usable.any() else blank[usable]))
 
 
-def _saturated(image: NDArray[Any]) -> float:
-    """Return the share of pixels that have the largest value, if that is of more than a few."""
-    return float(np.mean(image == image.max()))
+def _saturated(image: NDArray[Any], bad: NDArray[np.bool_] | None) -> float:
+    """Return the share of the usable pixels that have the largest value; 0 if all have one, which need not be white."""
+    values = image if bad is None else image[~bad]
+    largest = values.max()
+    return 0.0 if largest == values.min() else float(np.mean(values == largest))
 
 
 def _of_light(brightness: float, sharpness: float, blank: float, white: float) -> list[Fault]:

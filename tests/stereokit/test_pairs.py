@@ -141,6 +141,19 @@ def test_what_cannot_be_told_is_not_told():
         assert not report.rows_known
 
 
+def test_what_holds_nothing_is_not_white():
+    nothing = np.full((30, 40), np.nan, np.float32)
+    some = np.where(np.arange(40) < 20, np.nan, scene()[0][:30, :40].astype(np.float32))
+    for pair in ((nothing, nothing), (some, nothing), (nothing, some)):
+        assert kinds(check_pair(*pair)) == {"unusable"}
+    black = check_pair(np.zeros((30, 40), np.uint8), np.ones((30, 40), np.uint8))
+    assert (black.saturated, black.blank) == (0, 1) and kinds(black) == {"blank"}
+    left, right = (view.astype(np.float32) for view in scene())
+    left[:, : WIDTH // 2] = np.nan  # what is filled in there has no texture
+    half = check_pair(left, right, max_disparity=64)
+    assert half.blank < 0.05 and half.saturated < 0.05
+
+
 def test_bad_input_is_one_line():
     left, right = scene()
     for error, words, call in (

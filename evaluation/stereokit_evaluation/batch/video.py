@@ -82,6 +82,9 @@ class Video(Frames):
         finally:
             for capture in captures:
                 capture.release()
+        for path, size in zip(self.paths, sizes, strict=True):
+            if min(size) <= 0:
+                raise FileError(f"{str(path)!r} is not a video that can be read")
         if len(set(sizes)) > 1:
             texts = " and ".join(f"{width}x{height}" for width, height in sizes)
             raise InputError(f"the two videos must have the same size, got {texts}")

@@ -44,6 +44,7 @@ from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, rig_fil
 from stereokit.errors import FileError, OptionError, StereokitError, one_line
 from stereokit.images.check import check_integer
 from stereokit.io import DISPARITY_SUFFIXES, LAYOUTS, READABLE_SUFFIXES, read_disparity, read_image
+from stereokit.rig import read_rig
 from stereokit_evaluation.batch.bags import Bag, is_bag, write_bag
 from stereokit_evaluation.batch.combined import CombinedFiles
 from stereokit_evaluation.batch.job import Job, matcher_of
@@ -122,6 +123,8 @@ def batch(
     folder = os.path.abspath(output)
     check_rig_options(rig, alpha)
     raw = () if rig is None else tuple(os.path.abspath(path) for path in rig_files(rig))
+    if raw:
+        read_rig(*raw)  # refuses what is none, before each pair fails of it
     left_mask, other_mask = (None if path is None else os.path.abspath(path) for path in (mask, right_mask))
     for path in (mask, right_mask):
         if path is not None:

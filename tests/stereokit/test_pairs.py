@@ -233,8 +233,8 @@ def test_the_rows_of_few_points_are_those_of_the_oracle(dtype, stripes):
     few = valid & (np.arange(90) < 12)
     few[:, :9] = False
     shifts = oracles.row_shifts(pair.left, pair.right, disparity, few, scale)
-    told = offset_of(pair, disparity, few)
-    assert 30 <= len(shifts) < 200 and told == pytest.approx(
+    offset = offset_of(pair, disparity, few)
+    assert 30 <= len(shifts) < 200 and offset == pytest.approx(
         np.median([shift for shift, is_regular in shifts if is_regular or stripes]), abs=1e-4
     )
 

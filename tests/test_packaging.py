@@ -16,7 +16,13 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("stereokit", "refiners/stereokit_refiners", "evaluation/stereokit_evaluation")
 PRIVATE = {
     "stereokit/kernels/cache.py": {"numba.core.caching"},
-    "stereokit/kernels/jit.py": {"_nrt", "forceinline"},
+    "stereokit/kernels/jit.py": {
+        "_nrt",
+        "forceinline",
+        "no_cfunc_wrapper",
+        "no_cpython_wrapper",
+        "numba.core.registry",
+    },
     "stereokit/cuda/kernel.py": {"numba.cuda", "forceinline"},
 }
 """What is used of numba that its documentation does not promise, by file."""
@@ -31,15 +37,17 @@ def sources():
 def test_private_parts_of_numba_are_used_where_it_is_said():
     used: dict[str, set[str]] = {}
     for name, text in sources():
-        parts = set(re.findall(r"""["']?(_nrt|forceinline)["']?\s*[=:]""", text))
-        parts |= set(re.findall(r"^from (numba\.cuda|numba\.core\.caching) import", text, flags=re.M))
+        parts = set(re.findall(r"""["']?(_nrt|forceinline|no_cfunc_wrapper|no_cpython_wrapper)["']?\s*[=:]""", text))
+        parts |= set(
+            re.findall(r"^from (numba\.cuda|numba\.core\.caching|numba\.core\.registry) import", text, flags=re.M)
+        )
         if parts:
             used[name] = parts
     assert used == PRIVATE
 
 
 def test_numba_takes_the_private_options():
-    flags = {"_nrt": False, "forceinline": True}
+    flags = {"_nrt": False, "forceinline": True, "no_cfunc_wrapper": True}
     assert numba.njit(**flags)(lambda x: x + 1)(1) == 2
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from numba.core.registry import CPUDispatcher as Dispatcher
 from numba.extending import overload
 
 from stereokit.kernels.cache import cache_of
@@ -93,7 +94,17 @@ def kernel(function: F) -> F:
 def inline(function: F) -> F:
     """Compile `function` as a helper that kernels call and that is always inlined into them."""
     compiled: F = numba.njit(forceinline=True, no_cpython_wrapper=True, **_FLAGS)(function)
+    if isinstance(compiled, Dispatcher):  # not where NUMBA_DISABLE_JIT is set
+        compiled.__class__ = _Helper
     return compiled
+
+
+class _Helper(Dispatcher):  # type: ignore[misc]
+    """A compiled helper, which has no code for a call from Python: that would end the process."""
+
+    def __call__(self, *_: Any, **__: Any) -> Any:
+        """Refuse."""
+        raise TypeError(f"{self.__name__} is a helper of kernels; only compiled code may call it")
 
 
 def by_types(choose: F) -> F:
@@ -106,5 +117,5 @@ def by_types(choose: F) -> F:
     def stub(*arguments: Any) -> Any:
         raise NotImplementedError("compiled code only")
 
-    overload(stub, strict=False, jit_options={"forceinline": True})(choose)
+    overload(stub, strict=False, jit_options={"forceinline": True, "no_cfunc_wrapper": True})(choose)
     return stub  # type: ignore[return-value]

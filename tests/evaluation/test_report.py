@@ -204,7 +204,7 @@ def test_view_takes_refiners(files):
     [
         (("l.png", "none.png"), FileError, "no such file"),
         (("text.png", "r.png"), FileError, "is not an image"),
-        (("l.png", "small.png"), InputError, "must have the same size and number of channels, got 100x40 and 100x9"),
+        (("l.png", "small.png"), InputError, "must have the same size, got 100x40 and 100x9"),
         (("l.png", "r.png", "-o", "out.png"), FileError, "output must end in one of .html, .htm"),
         (("l.png", "r.png", "-o", "none/out.html"), FileError, "does not exist"),
         (("l.png", "r.png", "--refiner", "linear"), OptionError, "refiner needs --scale 0.5"),

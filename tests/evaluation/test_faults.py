@@ -38,6 +38,27 @@ def test_disturbances_are_counted(tmp_path, monkeypatch, capsys):
     assert f"{len(disturbed)} disturbed pairs:" in text
 
 
+def test_a_matcher_is_counted_and_its_cost_told(tmp_path, monkeypatch, capsys):
+    noise = cv2.GaussianBlur(np.random.default_rng(1).normal(128, 90, (60, 320)), (0, 0), 0.8).clip(0, 255)
+    for side, start in (("left", 0), ("right", 12)):
+        (tmp_path / "rendered" / side).mkdir(parents=True)
+        write_image(tmp_path / "rendered" / side / "a.png", noise[:, start : start + 300].astype(np.uint8))
+    pairs = list(faults.good_pairs(tmp_path))
+    alike = list(faults.altered_alike(*pairs[0][1:]))
+    assert [name for name, *_ in alike] == ["half size", "both top to bottom", "both darkened, with noise"]
+    assert alike[0][1].shape == (30, 150) and np.array_equal(alike[1][2], pairs[0][2][::-1])
+    assert alike[2][1].mean() < 0.4 * pairs[0][1].mean()
+    good = faults.Case("", frozenset(), *pairs[0][1:])
+    assert faults.matcher_kinds("S2", good) == set()
+    assert faults.matcher_kinds("S2", faults.Case("", frozenset(), good.right, good.left)) == {"exchanged"}
+    match, look, share = faults.look_cost(pairs, "S2", 155, 1, 2)
+    assert match > 0 and look > 0 and 0 < share
+    monkeypatch.setattr(faults, "_WIDTHS", (60,))
+    monkeypatch.setattr(sys, "argv", ["faults", "--data", str(tmp_path), "--cost", "S2"])
+    faults.main()
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
 def test_a_warped_image_is_where_it_should_be():
     image = np.zeros((61, 81), np.uint8)
     image[30, 60] = 255

@@ -6,13 +6,14 @@ disturbs one in `--every` of them, and KITTI 2015's tunnel, frame 000104, in two
 fault, how often it was said of good pairs, and for each disturbance, how often one of the expected faults was said.
 ``--quick`` looks at the small copies that `stereokit.Matcher` looks at. ``--match METHOD`` matches each pair with a new
 matcher and counts the faults that it tells; ``--alike`` adds good pairs whose views were altered alike: at half size,
-both top to bottom, both darkened with noise on them.
+both top to bottom, both darkened with noise on them. ``--cost METHOD`` times a matcher and its look instead.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from stereokit.images.gray import gray_pair
 from stereokit.pairs import KINDS, check_pair
 from stereokit_evaluation.data.datasets import Frame, eth3d, folder, kitti2012, kitti2015, middlebury
 
-__all__ = ["Case", "altered_alike", "cases", "good_pairs", "main", "matcher_kinds", "warped"]
+__all__ = ["Case", "altered_alike", "cases", "good_pairs", "look_cost", "main", "matcher_kinds", "warped"]
 
 _SETS = {
     "kitti2015": kitti2015, "kitti2012": kitti2012, "eth3d": eth3d, "middlebury": middlebury, "satellite": folder,
@@ -37,6 +38,7 @@ _SETS = {
 }  # fmt: skip
 _TUNNEL = "000104"
 _MAX_DISPARITY = 128
+_WIDTHS = (1242, 621, 310, 155)  # of images whose look is timed, pixels
 Gray = NDArray[np.uint8]
 
 
@@ -132,18 +134,55 @@ def matcher_kinds(method: str, case: Case) -> set[str]:
     return {fault.kind for fault in faults}
 
 
+def look_cost(
+    pairs: list[tuple[str, Gray, Gray]], method: str, width: int, threads: int, rounds: int
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the seconds of a match and of the look at it, medians, and the share that all looks are of all matches.
+
+    Parameters
+    ----------
+    pairs : list of (name, left, right)
+    method : str
+    width : int
+        To which the pairs are shrunk, pixels; a tenth of it is searched.
+    threads, rounds : int
+    """
+    matcher = Matcher(method, max_disparity=width // 10, threads=threads)
+    watch, times = PairWatch(), []
+    for turn in range(rounds + 1):
+        for _, *views in pairs:
+            size = width, round(views[0].shape[0] * width / views[0].shape[1])
+            small = [np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.uint8) for view in views]
+            start = time.perf_counter()
+            pair = gray_pair(small[0], small[1])
+            result = matcher.match_gray(pair, threads)
+            matched = time.perf_counter()
+            watch.faults(pair, result, matcher.min_disparity, matcher.max_disparity)
+            if turn:  # the first one compiles
+                times.append((matched - start, time.perf_counter() - matched))
+    match, look = np.median(times, axis=0)
+    totals = np.sum(times, axis=0)
+    return float(match), float(look), float(totals[1] / totals[0])
+
+
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--output", type=Path)
     parser.add_argument("--every", type=int, default=8)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--match", metavar="METHOD")
     parser.add_argument("--alike", action="store_true")
+    parser.add_argument("--cost", metavar="METHOD")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     pairs = list(good_pairs(options.data))
+    if options.cost:
+        _print_cost(pairs[: 8 * options.every : options.every], options.cost)
+        return
+    if options.output is None:
+        parser.error("--output is needed, unless --cost is given")
     with options.output.open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["pair", "disturbance", "expected", "said", "warned"])
@@ -172,6 +211,14 @@ def main() -> None:
         matched = f"  warned of {count['warned']:3d}, by its kind {count['warned so']:3d}" if options.match else ""
         share = f"{count['said']:3d} of {count['all']:3d} {100 * count['said'] / count['all']:6.1f} %"
         print(f"  {case_name:28s} {share}{matched}")
+
+
+def _print_cost(pairs: list[tuple[str, Gray, Gray]], method: str) -> None:
+    for width in _WIDTHS:
+        for threads in (2, 1):
+            match, look, share = look_cost(pairs, method, width, threads, 8 * _WIDTHS[0] // width)
+            times = f"match {1000 * match:.2f} ms, look {1000 * look:.3f} ms"
+            print(f"{method} {width} pixels wide, {threads} threads: {times}; of all {100 * share:.1f} %")
 
 
 def _good_cases(pairs: list[tuple[str, Gray, Gray]], alike: bool) -> Iterator[tuple[str, Case]]:

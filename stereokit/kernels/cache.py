@@ -19,6 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from numba import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 from numba.core.serialize import dumps
 
@@ -42,7 +43,7 @@ def _say_compiling(place: str) -> None:
     global _said
     if not _said:
         _said = True
-        say(f"compiling kernels for this processor, 10 to 20 seconds a method, {place}")
+        say(f"compiling kernels for this processor, up to 20 seconds a method, {place}")
 
 
 def _temporary_folder() -> Path | None:
@@ -149,7 +150,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
                 self.flush()  # an index that can be read, or nothing could be added
             code = None
         if code is None:
-            _say_compiling(f"once: they are kept in {self.cache_path}")
+            _say_compiling(f"once: they are kept in {config.CACHE_DIR or self.cache_path}")
         return code
 
     def save_overload(self, sig: Any, data: Any) -> None:

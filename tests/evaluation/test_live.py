@@ -49,6 +49,13 @@ def video(tmp_path_factory):
     return path
 
 
+def test_what_is_no_video_is_called_that(tmp_path):
+    path = tmp_path / "text.png"
+    path.write_text("hello")
+    with pytest.raises(stereokit.StereokitError, match=r"text\.png' is .*not?.* video that can be read"):
+        open_source([str(path)])
+
+
 class FakeSource:
     """A source of the frames of a list, without delay."""
 

@@ -210,6 +210,12 @@ def test_batch_rectifies_first_and_knows_its_rig(scene, tmp_path):
     assert "no such file" in run(*words, "--rig", tmp_path / "none.yml", status=2)
 
 
+def test_a_bad_rig_ends_a_batch_before_it_begins(scene, tmp_path):
+    (tmp_path / "bad.yml").write_text("K1: [1, 2")
+    output = run("batch", scene[0] / "raw", "-o", tmp_path / "maps", "--rig", tmp_path / "bad.yml", status=2)
+    assert "not valid YAML" in output and len(output.splitlines()) == 1 and not (tmp_path / "maps").exists()
+
+
 def test_view_rectifies_first(scene, tmp_path):
     pytest.importorskip("jinja2")
     folder, _, _ = scene

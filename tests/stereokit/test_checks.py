@@ -88,6 +88,13 @@ def test_large_pairs_are_warned_of(left, right, words, tmp_path):
         stereokit.match_large(LEFT, RIGHT, tmp_path / "map.npy", "S2", **OPTIONS)
 
 
+def test_a_large_pair_without_a_usable_pixel_is_called_that(tmp_path):
+    nothing = np.full((30, 40), np.nan, np.float32)
+    with pytest.warns(PairWarning, match="no pixel is usable") as caught:
+        stereokit.match_large(nothing, nothing.copy(), tmp_path / "map.npy", "S2", max_disparity=16)
+    assert len(caught) == 1
+
+
 def test_density_decides():
     assert [min_density(levels) for levels in (2048, 128, 64, 32, 16, 8, 1)] == [0.3, 0.3, 0.35, 0.4, 0.45, 0.45, 0.45]
     for measured, number in ((0, "0.0 %"), (9, "9.0 %"), (34, "34 %"), (35, None), (100, None)):

@@ -76,7 +76,7 @@ class Matcher:
         `stereokit.images.intensity` detects), ``confidence`` (bool), ``right`` (bool, the right view's map too;
         twice the time) and ``search`` ("full" tries all disparities at each pixel, "coarse-to-fine" 64 around the
         map of half the size, so that time and memory do not grow with the range; "auto" does so from 129 on, with
-        census+sgm on the CPU). Defaults are those of `stereokit.defaults`.
+        S2 on the CPU). Defaults are those of `stereokit.defaults`.
 
     Raises
     ------

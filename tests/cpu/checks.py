@@ -312,6 +312,23 @@ def check_narrow_worst():
     check_narrow(231, 231, 2, (4,))
 
 
+def check_narrow_zncc(shape=(5, 12), window=5):
+    """Compare rows of searches that begin anew after every third pixel with the same levels of the loops."""
+    from stereokit import Zncc
+    from stereokit.costs.rows import CostInput, Levels, cost_row
+    from stereokit.kernels.workspace import Workspace
+
+    left, right, expected = zncc_volume(shape, -2, 100, window)
+    starts = np.random.default_rng(3).choice([0, 8, 36], (shape[0], shape[1] // 3)).repeat(3, axis=1).astype(np.int16)
+    pair = CostInput(left, right, None, None, Levels(-2, 100), 1.0, 1, None, starts)
+    (rows,) = Zncc(window, 31).prepare(pair, Workspace(), 1)
+    for y in (0, 3, 2):
+        out = np.full(shape[1] * 64, 77, np.uint8)
+        cost_row(rows, y, out)
+        wanted = np.array([expected[y, x, s:][:64] for x, s in enumerate(starts[y])]) * 31
+        assert np.abs(out.reshape(wanted.shape) - wanted).max() <= 0.5 + 1e-4 * 31
+
+
 def check_smp():
     """Compare the single matching phase, with many equal costs."""
     from stereokit.postprocess import single_matching_phase

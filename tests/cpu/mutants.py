@@ -142,8 +142,7 @@ MUTANTS = [
     ),
     Mutant(
         "the row that goes is added", "costs.zncc",
-        "n_out = np.int32(-n) if row_out >= 0 else np.int32(0)", "n_out = n if row_out >= 0 else np.int32(0)",
-        _RULE, "zncc",
+        "_write_pairs(rows, 0, row_in, row_out, n, -n)", "_write_pairs(rows, 0, row_in, row_out, n, n)", _RULE, "zncc",
     ),
     Mutant(
         "the row that goes is one too low on the way up", "costs.zncc",
@@ -277,6 +276,18 @@ MUTANTS = [
     Mutant(
         "starts do not count in the map", "selection.wta",
         "minimum += np.int64(out.starts[to])", "pass", _RULE, "narrow",
+    ),
+    Mutant(
+        "the column that leaves is the next one", "costs.zncc",
+        "at = (x - 1) % window * LANES", "at = x % window * LANES", _RULE, "narrow_zncc",
+    ),
+    Mutant(
+        "the oldest column stays in the window", "costs.zncc",
+        "add(subtract(total, load(sums, at)), column)", "add(total, column)", _RULE, "narrow_zncc",
+    ),
+    Mutant(
+        "the last row of a window has a partner", "costs.zncc",
+        "y + 2 * pair + 1 if pair < rows.half else -1", "y + 2 * pair + 1", _RULE, "narrow_zncc",
     ),
     # ------------------------------------------------------------------ post-processing
     Mutant(

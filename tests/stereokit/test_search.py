@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ import stereokit
 from stereokit import Census, Matcher
 from stereokit.aggregation.sgm import Sgm
 from stereokit.cli import app
-from stereokit.costs.rows import CostInput, Levels
+from stereokit.costs.rows import CostInput, Levels, produce_volume
 from stereokit.errors import DeviceError, OptionError, UnknownNameError
 from stereokit.kernels.simd import LANES
 from stereokit.kernels.workspace import Workspace
@@ -116,6 +117,20 @@ def test_pixels_without_evidence_have_the_cost_of_the_border(random_pair):
     np.testing.assert_allclose(disparity, wanted, atol=1e-5)
 
 
+@pytest.mark.parametrize(("window", "steps"), [(3, 31), (5, 31), (7, 200)])
+def test_narrow_rows_of_zncc_are_parts_of_whole_ones(random_pair, window, steps):
+    left, noise = random_pair(11, 60, seed=window)
+    right = np.roll(left, -9, axis=1) // 2 + noise // 8
+    levels, cost = Levels(-5, 150), stereokit.Zncc(window, steps)
+    starts = np.random.default_rng(1).choice([0, 8, 40, 86], (11, 10)).repeat(6, axis=1).astype(np.int16)
+    pair = CostInput(left, right, None, None, levels, 0.5)
+    whole = produce_volume(cost.prepare(pair, Workspace(), 1), left.shape, levels, 1)
+    rows = cost.prepare(replace(pair, starts=starts), Workspace(), 1)
+    narrow_volume = produce_volume(rows, left.shape, Levels(0, LANES), 1)
+    wanted = np.take_along_axis(whole, starts[..., None].astype(np.int64) + np.arange(LANES), axis=2)
+    np.testing.assert_array_equal(narrow_volume, wanted)
+
+
 @pytest.mark.parametrize("paths", [4, 5, 8])
 def test_largest_costs_and_penalties_do_not_overflow(paths):
     left = np.zeros((6, 70), np.uint8)
@@ -197,10 +212,11 @@ def test_the_map_does_not_depend_on_the_threads(threads):
 )
 def test_a_shift_is_found_wherever_it_lies(minimum, maximum, shift):
     left, right = textured(64, 640, shift)
-    result = Matcher("S2", min_disparity=minimum, max_disparity=maximum, search="coarse-to-fine")(left, right)
-    inner = result.disparity[:, shift + 8 :]
-    assert (abs(inner - shift) < 0.5).mean() > 0.995
-    assert result.disparity.min() >= minimum and result.disparity.max() < maximum
+    for method in ("S2", "S4"):
+        result = Matcher(method, min_disparity=minimum, max_disparity=maximum, search="coarse-to-fine")(left, right)
+        inner = result.disparity[:, shift + 8 :]
+        assert (abs(inner - shift) < 0.5).mean() > 0.995
+        assert result.disparity.min() >= minimum and result.disparity.max() < maximum
 
 
 @pytest.mark.parametrize("shape", [(1, 300), (2, 2), (3, 200), (40, 1), (1, 1), (33, 45)])
@@ -266,6 +282,8 @@ def test_auto_searches_in_full_up_to_128_levels(random_pair):
     assert Matcher("S2", max_disparity=129).settings.coarse_to_fine
     assert not Matcher("S2", max_disparity=256, scale=0.5).settings.coarse_to_fine  # 128 levels at half size
     assert not Matcher("S1", max_disparity=512).settings.coarse_to_fine
+    assert not Matcher("S4", max_disparity=512).settings.coarse_to_fine
+    assert Matcher("S4", max_disparity=512, search="coarse-to-fine").settings.coarse_to_fine
     assert Matcher("S2", max_disparity=129).identity()["search"] == "coarse-to-fine"
     assert Matcher("S2", max_disparity=128).identity()["search"] == "full"
     full = Matcher("S2", max_disparity=64)(left, right).disparity

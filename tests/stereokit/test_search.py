@@ -269,11 +269,11 @@ def test_poles_in_front_of_a_far_wall_are_not_lost():
             left[:, x : x + side] = surface
             right[:, x - wall - gap : x - wall - gap + side] = surface
             pole[:, x : x + side] = True
-        found = []
+        shares = []
         for search in ("full", "coarse-to-fine"):
             disparity = stereokit.match(left, right, max_disparity=256, search=search)
-            found.append((abs(disparity[pole] - wall - gap) < 1.5).mean())
-        assert found[1] >= share * found[0] > 0.5 * share, (gap, side, found)
+            shares.append((abs(disparity[pole] - wall - gap) < 1.5).mean())
+        assert shares[1] >= share * shares[0] > 0.5 * share, (gap, side, shares)
 
 
 def test_auto_searches_in_full_up_to_128_levels(random_pair):

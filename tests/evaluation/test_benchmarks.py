@@ -17,7 +17,7 @@ NAN, INF = np.nan, np.inf
 
 
 def middlebury_by_loop(disp, gt, mask, threshold, maxdisp, rounddisp, size):
-    """Return bad, invalid, all pixels and the sum of errors, as the development kit counts, truth of relative `size`."""
+    """Return bad, invalid, all pixels and the sum of errors, as the development kit counts them."""
     scale = len(gt[0]) // len(disp[0])
     n = bad = invalid = 0
     total = 0.0
@@ -196,7 +196,10 @@ def test_a_map_is_scored_dense_and_sparse():
 
 
 def test_averages_follow_the_benchmark():
-    official = {"dense": {"nonocc": {"pixels": 1.0, "bad-2": 8.0}, "all": None}, "sparse": {"nonocc": None, "all": None}}
+    official = {
+        "dense": {"nonocc": {"pixels": 1.0, "bad-2": 8.0}, "all": None},
+        "sparse": {"nonocc": None, "all": None},
+    }
     other = {"dense": {"nonocc": {"pixels": 1.0, "bad-2": 2.0}, "all": None}, "sparse": {"nonocc": None, "all": None}}
     figures = {"Vintage": official, "Pipes": other, "x": None}
     assert average_official("middlebury", figures)["dense"]["nonocc"]["bad-2"] == (0.5 * 8 + 2) / 1.5

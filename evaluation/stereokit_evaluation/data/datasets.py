@@ -42,6 +42,7 @@ _LEVELS = {"2001": 8, "2003": 4, "2006": 3}  # levels a pixel in the 8-bit dispa
 _WIDEST = {"2001": 1000, "2003": 450, "2006": 480}  # a wider image is of a larger edition, with other levels
 _SCENE_SIZE = (640, 384)  # width, height
 _MAPS = (*DISPARITY_SUFFIXES, ".tif")
+_ETH3D_DISPARITIES = 64  # its calibrations name the width of the image; true disparities are well below this
 _NEIGHBOURS = 10  # frames of KITTI with numbers next to each other, taken for one drive
 _VARIANTS = {
     "middlebury": r"\b(Motorcycle|Piano|Playtable)[ELP]$",  # other exposure, light or rectification of one scene
@@ -110,7 +111,10 @@ def middlebury(root: str | Path) -> list[Frame]:
 
 @data_set
 def eth3d(root: str | Path) -> list[Frame]:
-    """Return the ETH3D pairs below `root`: ``im0.png``, ``im1.png``, ``disp0GT.pfm``, ``mask0nocc.png``."""
+    """Return the ETH3D pairs below `root`: ``im0.png``, ``im1.png``, ``disp0GT.pfm``, ``mask0nocc.png``.
+
+    The ``ndisp`` of its calibrations is about the width of the image and no range to search: 64 at most are suggested.
+    """
     base = _root(root)
     frames = [*_with_calibration(base, "eth3d")]
     return _sorted_frames("ETH3D", frames, base, "folders with im0.png, im1.png, disp0GT.pfm")
@@ -284,13 +288,16 @@ def _with_calibration(base: Path, benchmark: str) -> Iterator[Frame]:
         truth = next((path for name in ("disp0GT.pfm", "disp0.pfm") if (path := scene / name).exists()), None)
         occ, mask = _lazy(read_disparity, truth), _existing(scene / "mask0nocc.png")
         name, fields = _name(base, scene), _fields(scene / "calib.txt")
+        levels = _ndisp(fields)
+        if benchmark == "eth3d" and levels is not None:
+            levels = min(levels, _ETH3D_DISPARITIES)
         yield Frame(
             name,
             left,
             _sibling(scene, "im1") or scene / "im1.png",
             noc=None if occ is None or mask is None else partial(_masked, occ, mask),
             occ=occ,
-            max_disparity=_ndisp(fields),
+            max_disparity=levels,
             calibration=partial(read_calibration, path) if (path := scene / "calib.txt").exists() else None,
             scene=re.sub(_VARIANTS[benchmark], r"\1", name),
             benchmark=Benchmark(benchmark, integer=fields.get("isint", "").strip() == "1"),

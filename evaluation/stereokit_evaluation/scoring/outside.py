@@ -50,6 +50,7 @@ __all__ = [
     "map_of",
     "named",
     "outside_function",
+    "outside_methods",
     "program",
 ]
 
@@ -91,8 +92,12 @@ class FunctionMethod:
 
     def identity(self) -> dict[str, Any]:
         """Return the name, the range and a digest of the source file."""
-        file = inspect.getsourcefile(inspect.unwrap(self.function)) if callable(self.function) else None
-        return {"function": self.name, "levels": self.max_disparity, "source": _digest(file)}
+        try:
+            file = inspect.getsourcefile(inspect.unwrap(self.function))
+        except TypeError:  # an object with __call__, or a compiled function
+            file = getattr(sys.modules.get(type(self.function).__module__), "__file__", None)
+        place = f"{getattr(self.function, '__module__', '')}:{getattr(self.function, '__qualname__', '')}"
+        return {"function": place, "levels": self.max_disparity, "source": _digest(file)}
 
     def __call__(self, frame: Frame, left: NDArray[Any], right: NDArray[Any]) -> Disparity:
         """Return the function's map."""
@@ -182,20 +187,60 @@ class MapFolder:
         return checked_map(self.name, read_disparity(map_of(self.folder, frame.name)), left.shape[:2])
 
 
+def outside_methods(
+    functions: Sequence[str],
+    commands: Sequence[str],
+    predictions: Sequence[str],
+    *,
+    max_disparity: int,
+    time_limit: float | None = None,
+    dataset: str | None = None,
+) -> list[OutsideMethod]:
+    """Return the methods of others that a command line names, in this order.
+
+    Parameters
+    ----------
+    functions, commands, predictions : sequence of str
+        As `outside_function`, `program` and `map_folder` take them.
+    max_disparity : int
+        Disparities to search.
+    time_limit : float, optional
+        Of programs, seconds for one pair.
+    dataset : str, optional
+        The data set, for folders of maps.
+
+    Raises
+    ------
+    OptionError, FileError
+        If one cannot be used, or two have the same name.
+    """
+    if time_limit is not None and not commands:
+        raise OptionError(f"time_limit must go with command, got {time_limit:g} alone")
+    methods: list[OutsideMethod] = [outside_function(text, max_disparity) for text in functions]
+    methods += [program(text, max_disparity, time_limit) for text in commands]
+    methods += [map_folder(text, dataset) for text in predictions]
+    names = [method.name for method in methods]
+    for name in names:
+        if names.count(name) > 1:
+            raise OptionError(f"methods must have different names, got {name!r} twice; use NAME=...")
+    return methods
+
+
 def is_function(text: str) -> bool:
-    """Return whether a method's name is that of a function, ``module:function``."""
-    return re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", text.strip()) is not None
+    """Return whether a method's name is that of a function, ``module:function`` or ``NAME=module:function``."""
+    return re.fullmatch(r"([^=]+=)?\s*[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", text.strip()) is not None
 
 
 def outside_function(text: str, max_disparity: int) -> FunctionMethod:
-    """Import ``module:function``, from the working folder too.
+    """Import ``module:function`` or ``NAME=module:function``, from the working folder too.
 
     Raises
     ------
     OptionError
         If it cannot be imported or cannot be called.
     """
-    module_name, _, path = text.strip().partition(":")
+    name, target_name = named("method", text) if "=" in text else (text.strip(), text.strip())
+    module_name, _, path = target_name.partition(":")
     try:
         with _working_folder_first():
             target: Any = importlib.import_module(module_name)
@@ -206,7 +251,7 @@ def outside_function(text: str, max_disparity: int) -> FunctionMethod:
         raise OptionError(f"method must name a function that can be imported, got {text!r}: {reason}") from error
     if not callable(target):
         raise OptionError(f"method must name a function, got {text!r}, which is {type(target).__name__}")
-    return FunctionMethod(text.strip(), target, max_disparity)
+    return FunctionMethod(name, target, max_disparity)
 
 
 def program(text: str, max_disparity: int, time_limit: float | None = None) -> Program:
@@ -239,7 +284,7 @@ def program(text: str, max_disparity: int, time_limit: float | None = None) -> P
 
 
 def map_folder(text: str, dataset: str | None = None) -> MapFolder:
-    """Return the maps of ``--predictions NAME=DIR``, or of ``DIR``, whose name then is that of the folder.
+    """Return the maps of ``--predictions NAME=DIR``, or of ``DIR``, which is called "predictions".
 
     Parameters
     ----------
@@ -252,7 +297,7 @@ def map_folder(text: str, dataset: str | None = None) -> MapFolder:
     FileError
         If there is no such folder.
     """
-    name, place = named("predictions", text) if "=" in text else (Path(text).resolve().name or "predictions", text)
+    name, place = named("predictions", text) if "=" in text else ("predictions", text)
     base = Path(place)
     if not base.is_dir():
         raise FileError(f"predictions must be a folder, got {place!r}, which is not")

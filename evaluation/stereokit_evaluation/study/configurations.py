@@ -78,8 +78,8 @@ class Configuration:
         Why it cannot be built, in one line.
     outside : OutsideMethod or None
         A method of others, which is given the frame and its images as they are stored.
-    by_frame : mapping of str to Configuration, optional
-        Where one row has frames of several data sets: the configuration of each frame by its name.
+    by_frame : mapping, optional
+        Where one row has frames of several data sets: each frame's own configuration and frame, by the name in the row.
     """
 
     method: str
@@ -89,7 +89,7 @@ class Configuration:
     identity: dict[str, Any] = field(default_factory=dict)
     missing: str | None = None
     outside: OutsideMethod | None = None
-    by_frame: Mapping[str, Configuration] = field(default_factory=dict)
+    by_frame: Mapping[str, tuple[Configuration, Frame]] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -117,9 +117,9 @@ class Configuration:
 
     def match_frame(self, frame: Frame, *, gray: bool = True) -> Any:
         """Return the result of matching a frame, whose images are loaded as the method wants them."""
-        chosen = self.by_frame.get(frame.name, self)
-        left, right = frame.load_pair(gray=gray and chosen.outside is None)
-        return chosen.match(frame, left, right)
+        chosen, own = self.by_frame.get(frame.name, (self, frame))
+        left, right = own.load_pair(gray=gray and chosen.outside is None)
+        return chosen.match(own, left, right)
 
     def match(self, frame: Frame, left: Any, right: Any) -> Any:
         """Return the result for two images of a frame: grey ones, or for a method of others as they are stored."""
@@ -238,10 +238,9 @@ def outside(method: OutsideMethod) -> Configuration:
     return Configuration(method.name, method.name, BASELINE, identity=method.identity(), outside=method)
 
 
-def merged(configurations: Mapping[str, Configuration]) -> Configuration:
-    """Return one configuration for frames of several data sets: each frame's own by the name of the frame."""
-    first = next(iter(configurations.values()))
-    return replace(first, by_frame=dict(configurations))
+def merged(configuration: Configuration, by_frame: Mapping[str, tuple[Configuration, Frame]]) -> Configuration:
+    """Return one configuration for frames of several data sets (`Configuration.by_frame`)."""
+    return replace(configuration, by_frame=dict(by_frame))
 
 
 @cache

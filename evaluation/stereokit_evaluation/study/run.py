@@ -26,6 +26,7 @@ from stereokit.kernels.trace import observed
 from stereokit.notices import collecting
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, StageTimer
 from stereokit_evaluation.data import datasets
+from stereokit_evaluation.data import disturbed as disturbed_frames
 from stereokit_evaluation.data import frame as frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring import assessment, eth3d, kitti, measures, middlebury
@@ -34,6 +35,8 @@ from stereokit_evaluation.scoring.outside import Program
 from stereokit_evaluation.scoring.runner import Result, Scored, Skipped
 from stereokit_evaluation.study.configurations import BASELINE, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
+from stereokit_evaluation.synthetic import disturbances as faults
+from stereokit_evaluation.synthetic import sensors
 
 __all__ = ["Study", "StudyRow", "measure", "run_study"]
 
@@ -287,7 +290,7 @@ def _times_failed(failures: dict[str, list[tuple[int | None, str]]], index: int)
 
 def _source() -> list[str]:
     """Return the digests of the modules that scores and times depend on."""
-    modules = (datasets, frames, kitti, measures, assessment, eth3d, middlebury)
+    modules = (datasets, frames, disturbed_frames, faults, sensors, kitti, measures, assessment, eth3d, middlebury)
     return [fingerprint(Path(str(file))) for file in (*(module.__file__ for module in modules), __file__)]
 
 

@@ -14,6 +14,7 @@ from rich.console import Console
 from stereokit.cli.output import Table
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL
 from stereokit_evaluation.data import published
+from stereokit_evaluation.scoring import middlebury
 from stereokit_evaluation.scoring.assessment import average_official
 from stereokit_evaluation.scoring.measures import FIGURES
 from stereokit_evaluation.scoring.summary import pixels_line, summary
@@ -25,6 +26,7 @@ __all__ = [
     "as_json",
     "missing_lines",
     "official_json",
+    "print_disturbances",
     "print_measures",
     "print_overview",
     "print_tables",
@@ -33,6 +35,7 @@ __all__ = [
 
 _D1 = [(region, part) for region in ("noc", "occ") for part in ("all", "bg", "fg")]
 _WIDTH = 130
+_WIDEST = 400
 _FEW_SCENES = 6
 _SHOWN = ("bad-0.5", "bad-1", "bad-2", "bad-4", "epe", "rmse", "a90", "a95", "density")
 
@@ -124,8 +127,8 @@ def missing_lines(rows: Sequence[StudyRow]) -> list[str]:
 def print_tables(heading: str, study: Study, note: str) -> None:
     """Print accuracy, then times, then the missing variants."""
     console = _console()
-    console.print(_accuracy(heading, study.rows))
-    console.print(_times(study.rows))
+    _print_whole(console, _accuracy(heading, study.rows))
+    _print_whole(console, _times(study.rows))
     for line in (*missing_lines(study.rows), note):
         console.print(line, markup=False, highlight=False)
 
@@ -135,14 +138,14 @@ def print_measures(heading: str, study: Study, official: Mapping[str, Any] | Non
     if not _frames(study):
         return
     console = _console()
-    console.print(_measures(heading, study))
+    _print_whole(console, _measures(heading, study))
     console.print(_pixels_line(study), markup=False, highlight=False)
     for benchmark, rows in (official or {}).items():
         if any(entry["average"] is not None for entry in rows.values()):
-            console.print(_official_table(benchmark, rows))
+            _print_whole(console, _official_table(benchmark, rows))
             console.print(_OFFICIAL_LINES[benchmark], markup=False, highlight=False)
     if (table := _leads(study)) is not None:
-        console.print(table)
+        _print_whole(console, table)
         console.print(_scenes_line(study), markup=False, highlight=False)
 
 
@@ -160,13 +163,36 @@ def print_overview(studies: Mapping[str, Study], figures: Sequence[str] = ("d1",
             mean = fmean(known) if known and len(known) == len(cells) else None
             names = row.configuration.label, _setting(row)
             table.add_row(*names, *(_figure(cell) for cell in (*cells, mean)), end_section=_ends(first.rows, index))
-        console.print(table)
+        _print_whole(console, table)
+
+
+def print_disturbances(document: Mapping[str, Any], figure: str = "d1") -> None:
+    """Print one table for each fault: a figure of each row against the strength.
+
+    Parameters
+    ----------
+    document : mapping
+        As `stereokit_evaluation.study.disturbances.disturbances_json` returns it.
+    figure : str
+        One of its figures.
+    """
+    console = _console()
+    for kind, entry in document.items():
+        where = "both views" if entry["views"] == "both" else "right view"
+        heading = f"{kind} ({entry['about']}; {where}): {_head(figure)} in {FIGURES[figure].unit} by {entry['unit']}"
+        console.print(heading, markup=False, highlight=False, style="italic")
+        table = _table(None, ("method",))
+        for head in ("none", *(f"{strength:g}" for strength in entry["strengths"])):
+            table.add_column(head, justify="right")
+        for row in entry["results"]:
+            table.add_row(row["name"], *map(_figure, (row["undisturbed"][figure], *row["figures"][figure])))
+        _print_whole(console, table)
 
 
 _OFFICIAL_LINES = {
     "middlebury": (
-        "Middlebury v3: pixels and thresholds at full size; dense: the map as returned, invalid pixels are bad; sparse: "
-        "measured pixels, invalid ones apart; average over its training pairs, five hard ones by half."
+        "Middlebury v3: pixels and thresholds at full size; dense: the map as returned, invalid pixels are bad; "
+        "sparse: measured pixels, invalid ones apart; average over its training pairs, five hard ones by half."
     ),
     "eth3d": (
         "ETH3D: dense: the map as returned; sparse: measured pixels; pixels without estimate lower the coverage and "
@@ -196,8 +222,13 @@ _OFFICIAL_COLUMNS = {
 
 
 def _official_table(benchmark: str, rows: Mapping[str, Any]) -> Table:
-    pairs = max(sum(entry is not None for entry in row["frames"].values()) for row in rows.values())
-    table = Table(title=f"{benchmark}, its own rules, up to {pairs} pairs", box=SIMPLE_HEAD, pad_edge=False)
+    names = [name for name, entry in next(iter(rows.values()))["frames"].items() if entry is not None]
+    if benchmark == "middlebury":
+        names = [name for name in names if name.rpartition("/")[2] in middlebury.WEIGHTS]
+    heading = f"{benchmark}, its own rules, {len(names)} pair{'' if len(names) == 1 else 's'}"
+    if benchmark == "middlebury":
+        heading += f" of the {len(middlebury.WEIGHTS)} of its table"
+    table = Table(title=heading, box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("method", no_wrap=True)
     for *_, head in _OFFICIAL_COLUMNS[benchmark]:
         table.add_column(head, justify="right")
@@ -325,7 +356,13 @@ def _console() -> Console:
     return Console(width=None if sys.stdout.isatty() else _WIDTH)
 
 
-def _table(heading: str, columns: Iterable[str] = ("matcher", "setting")) -> Table:
+def _print_whole(console: Console, table: Table) -> None:
+    """Print a table without cutting its figures, though it be wider than the terminal."""
+    width = console.measure(table, options=console.options.update(width=_WIDEST)).maximum
+    Console(width=max(width, console.width)).print(table)
+
+
+def _table(heading: str | None, columns: Iterable[str] = ("matcher", "setting")) -> Table:
     table = Table(title=heading, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     for column in columns:
         table.add_column(column, no_wrap=True)

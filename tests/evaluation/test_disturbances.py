@@ -123,6 +123,8 @@ def test_strengths_are_read():
     assert list(every) == ["noise", *(kind for kind in DISTURBANCES if kind != "noise")] and every["noise"] == (3,)
     with pytest.raises(OptionError, match="disturb must name each kind once, got 'noise' twice"):
         parse_disturbances(["noise", "noise:2"])
+    with pytest.raises(OptionError, match="disturb must name a kind with its strengths, got 'all:3'"):
+        parse_disturbances(["all:3"])
 
 
 def test_a_disturbed_frame_has_the_old_truth_and_a_digest_of_its_own(tmp_path):

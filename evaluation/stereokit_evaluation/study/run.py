@@ -137,6 +137,7 @@ def run_study(
     repeats: int = 3,
     gray: bool = True,
     about_times: Any = None,
+    warm_up: bool = True,
     step: Callable[[str, int], None] = lambda text, advance: None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Study:
@@ -154,6 +155,8 @@ def run_study(
         Give grey images.
     about_times : any
         Further conditions of the times: threads, processor.
+    warm_up : bool
+        Call each configuration once before it is timed. Without, the first time is too long, and nothing is repeated.
     step : callable
         Called with a short text and a number of steps, before each configuration of each frame.
     report : callable
@@ -174,7 +177,7 @@ def run_study(
     records: dict[int, dict[str, Record]] = {index: {} for index in range(len(configurations)) if index not in missing}
     failures: dict[str, list[tuple[int | None, str]]] = {}
     scenes: dict[str, str | None] = {}
-    warm: set[int] = set()
+    warm: set[int] = set() if warm_up else set(range(len(configurations)))
 
     def fail(frame: Frame, index: int | None, reason: str) -> None:
         report(f"skipped {frame.name}: {_named(configurations, index, reason)}")

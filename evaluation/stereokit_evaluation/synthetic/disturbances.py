@@ -205,7 +205,9 @@ def parse_disturbances(texts: list[str]) -> dict[str, tuple[float, ...]]:
     chosen: dict[str, tuple[float, ...]] = {}
     for text in texts:
         name, separator, numbers = (part.strip() for part in text.partition(":"))
-        if name == "all" and not separator:
+        if name == "all":
+            if separator:
+                raise OptionError(f"disturb must name a kind with its strengths, got {text!r}")
             chosen |= {kind: fault.strengths for kind, fault in DISTURBANCES.items() if kind not in chosen}
             continue
         fault = _kind(name)

@@ -82,7 +82,7 @@ def run_disturbances(
         for strength in values:
             study = run_study(
                 [disturbed(frame, kind, strength) for frame in frames], movable, store, repeats=1,
-                about_times="disturbed", step=step, report=lines,
+                about_times="disturbed", warm_up=False, step=step, report=lines,
             )  # fmt: skip
             result.studies[kind, strength] = study
             if study.interrupted:

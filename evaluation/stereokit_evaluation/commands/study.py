@@ -163,7 +163,7 @@ def study(
         rows += [baseline(key, part.levels) for key in dict.fromkeys(modes)]
         others = outside_methods(
             functions, command or (), predictions or (), max_disparity=part.levels, time_limit=time_limit,
-            dataset=part.name if len(parts) > 1 else None,
+            dataset=part.name,
         )  # fmt: skip
         return rows + [outside(other) for other in others]
 

@@ -97,9 +97,9 @@ def test_a_program_is_given_paths_and_the_range_whole(frame, script, tmp_path):
 
 
 def test_images_that_are_no_files_are_written(script):
-    made = Frame("a", lambda: image(3), lambda: image(7))
+    drawn = Frame("a", lambda: image(3), lambda: image(7))
     method = program(script(SAVE, "{left} {right} {out.npy}"), 64)
-    assert (method(made, image(3), image(7)).disparity == 7).all()
+    assert (method(drawn, image(3), image(7)).disparity == 7).all()
 
 
 @pytest.mark.parametrize("suffix", [".pfm", ".tiff", ".png"])

@@ -27,6 +27,7 @@ from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.kitti import score
 from stereokit_evaluation.study import run as study_run
 from stereokit_evaluation.study.configurations import Configuration
+from stereokit_evaluation.study.data import parse_data
 from stereokit_evaluation.study.run import run_study
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
 from stereokit_evaluation.training import per_matcher
@@ -466,6 +467,13 @@ def test_frames_are_chosen_for_each_data_set(tmp_path):
     assert many(tmp_path, "--max-frames", "2")["frames"][2:] == ["folder-2/000", "folder-2/002"]
 
 
+def test_data_sets_have_names(tmp_path):
+    assert [(name, kind) for name, kind, _ in parse_data(["folder:a", "sat=folder:b", "folder:c", "scenes"])] == [
+        ("folder", "folder"), ("sat", "folder"), ("folder-3", "folder"), ("scenes", "scenes"),
+    ]  # fmt: skip
+    assert parse_data(["eth3d:C:/x y"]) == [("eth3d", "eth3d", Path("C:/x y"))]
+
+
 def test_others_have_rows_like_ours(pairs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine_for_study.py").write_text("def run(left, right):\n    return left * 0.0 + 4\n")
@@ -520,6 +528,8 @@ def test_benchmarks_have_their_own_figures(tmp_path):
     [
         (("--data", "folder"), "data must be NAME:DIR, got 'folder' without a folder"),
         (("--data", "nothing:."), "data must be NAME:DIR with a name of kitti2015"),
+        (("--data", "x=folder:.", "--data", "x=folder:."), "data must have different names, got 'x' twice"),
+        (("--data", "a/b=folder:."), "data must have names of letters, digits"),
         (("--data", "folder:.", "--root", "."), "dataset and root must not be set with data"),
         (("--data", "folder:.", "--frames", "kitti:3"), "frames must be DATA:SELECTION with DATA one of folder"),
         (("--data", "folder:.", "--data", "folder:.", "--train"), "train must go with one data set, got 2"),

@@ -63,7 +63,7 @@ def study(
     dataset: Annotated[str | None, typer.Option(help=f"One of {', '.join(dataset_names())}; default scenes.")] = None,
     root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
     data: Annotated[
-        list[str] | None, typer.Option(metavar="NAME:DIR", help="A data set and its folder; may repeat.")
+        list[str] | None, typer.Option(metavar="[NAME=]DATA:DIR", help="A data set and its folder; may repeat.")
     ] = None,
     split_name: Annotated[
         str | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -53,24 +54,29 @@ class DataPart:
 
 
 def parse_data(texts: Sequence[str]) -> list[tuple[str, str, Path | None]]:
-    """Return the name, the data set and the folder of each ``NAME:DIR``; ``scenes`` needs no folder.
+    """Return the name, the data set and the folder of each ``DATA:DIR`` or ``NAME=DATA:DIR``; ``scenes`` has no folder.
 
-    A data set that is there twice gets a number: ``"folder"``, ``"folder-2"``.
+    The name is that of the data set if none is there; a second one gets a number: ``"folder"``, ``"folder-2"``.
 
     Raises
     ------
     OptionError
-        If a part is missing.
+        If a part is missing, or two have one name.
     """
     parts: list[tuple[str, str, Path | None]] = []
     for text in texts:
-        dataset, _, folder = (part.strip() for part in text.partition(":"))
+        head, _, folder = (part.strip() for part in text.partition(":"))
+        own, separator, dataset = (part.strip() for part in head.rpartition("="))
         if dataset not in DATASETS and dataset != "scenes":
             raise OptionError(f"data must be NAME:DIR with a name of {', '.join(dataset_names())}, got {text!r}")
         if not folder and dataset != "scenes":
             raise OptionError(f"data must be NAME:DIR, got {text!r} without a folder")
+        if separator and not re.fullmatch(r"[A-Za-z0-9_.+-]+", own):
+            raise OptionError(f"data must have names of letters, digits, _, ., + and -, got {text!r}")
         times = sum(dataset == other for _, other, _ in parts)
-        name = dataset if not times else f"{dataset}-{times + 1}"
+        name = own or (dataset if not times else f"{dataset}-{times + 1}")
+        if name in (other for other, _, _ in parts):
+            raise OptionError(f"data must have different names, got {name!r} twice")
         parts.append((name, dataset, Path(folder) if folder else None))
     return parts
 

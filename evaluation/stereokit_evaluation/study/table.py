@@ -17,6 +17,7 @@ from stereokit_evaluation.data import published
 from stereokit_evaluation.scoring import middlebury
 from stereokit_evaluation.scoring.assessment import average_official
 from stereokit_evaluation.scoring.measures import FIGURES
+from stereokit_evaluation.scoring.statistics import DRAWS
 from stereokit_evaluation.scoring.summary import pixels_line, summary
 from stereokit_evaluation.study.comparison import best_row, compare_rows, comparisons, intervals, scene_names
 from stereokit_evaluation.study.configurations import BASELINE, title
@@ -288,13 +289,12 @@ def _leads(study: Study) -> Table | None:
 
 def _scenes_line(study: Study) -> str:
     frames = _frames(study)
-    scenes = len(scene_names(frames))
-    line = (
-        f"Intervals: 2000 bootstrap draws of {scenes} scene{'' if scenes == 1 else 's'} ({len(frames)} pairs); p: "
-        "exchanges of the two methods by scene."
-    )
+    scenes, pairs = len(scene_names(frames)), f"{len(frames)} pair{'' if len(frames) == 1 else 's'}"
+    if scenes == 1:
+        return f"Intervals and p: none, as the {pairs} show one scene."
+    line = f"Intervals: {DRAWS} bootstrap draws of {scenes} scenes ({pairs}); p: exchanges of the two methods by scene."
     if scenes < _FEW_SCENES:
-        line += f" So few scenes say little: p cannot be below {2 / 2**scenes:.2g}."
+        line += f" So few scenes say little: intervals are too narrow, and p cannot be below {2 / 2**scenes:.2g}."
     return line
 
 

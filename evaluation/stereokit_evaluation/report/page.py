@@ -162,13 +162,12 @@ def _share(counts: Sequence[int]) -> float:
 
 def _viewer_pair(frame: Frame, rows: Sequence[StudyRow]) -> dict[str, Any]:
     """Match a frame once more with every configuration, for the viewer."""
-    left, right = frame.load_left(gray=True), frame.load_right(gray=True)
     maps = []
     for row in rows:
         scored = next((candidate for candidate in row.result.frames if candidate.name == frame.name), None)
-        if row.configuration.matcher is not None and scored is not None:
+        if row.configuration.can_match and scored is not None:
             with collecting():  # reported when it was scored
-                result = row.configuration.matcher(left, right)
+                result = row.configuration.match_frame(frame)
             disparity, valid = np.asarray(result.disparity), np.asarray(result.valid)
             maps.append(viewer.MethodMap(row.configuration.name, disparity, valid, _note(scored)))
     return viewer.pair(

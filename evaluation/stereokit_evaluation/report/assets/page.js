@@ -48,6 +48,7 @@ const Page = (() => {
   function start() {
     theme();
     sorting();
+    Pairs.start();
     Viewer.start();
   }
 

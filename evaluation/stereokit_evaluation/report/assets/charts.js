@@ -32,6 +32,8 @@ document.addEventListener("DOMContentLoaded", async () => {
   const script = document.createElement("script");
   script.textContent = new TextDecoder().decode(source);
   document.head.append(script);
+  script.remove(); // some megabytes of text
+  document.getElementById("plotly").remove();
 
   const region = document.getElementById("region");
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

@@ -2,7 +2,12 @@
 "use strict";
 
 const Maps = (() => {
-  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  function bytes(text) {
+    const letters = atob(text);
+    const out = new Uint8Array(letters.length);
+    for (let i = 0; i < out.length; i++) out[i] = letters.charCodeAt(i);
+    return out;
+  }
 
   async function inflate(text, format = "deflate") {
     const stream = new Blob([bytes(text)]).stream().pipeThrough(new DecompressionStream(format));

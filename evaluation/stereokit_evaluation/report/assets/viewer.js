@@ -29,11 +29,14 @@ const Viewer = (() => {
   const get = (id) => document.getElementById(id);
   const read = (id) => JSON.parse(get(id).textContent);
   const MOST = 8; // decoded maps that are kept
+  const kept = []; // they themselves, the oldest first
   const text = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)}${unit}` : "–");
 
-  async function start() {
+  let started = null;
+  const start = () => (started ??= begin());
+
+  async function begin() {
     const root = get("viewer");
-    if (!root) return;
     const rules = read("constants");
     const canvases = {
       left: get("view-left"), right: get("view-right"), disparity: get("view-disparity"), disparityB: get("view-disparity-b"),
@@ -47,7 +50,6 @@ const Viewer = (() => {
     const cloud = new Cloud(get("view-cloud"));
     const state = { pair: null, a: null, b: null, x: 0, y: 0, cx: 0, cy: 0, cloud: false, load: 0 };
     const cache = new Map();
-    const kept = []; // the decoded maps, the oldest first
 
     function keep(entry) {
       if (kept.includes(entry)) kept.splice(kept.indexOf(entry), 1);
@@ -329,5 +331,10 @@ const Viewer = (() => {
   }
 
   let choose = null;
-  return { start, show: (frame, a, b) => choose?.(frame, a, b) };
+  async function show(frame, a, b) {
+    await start();
+    return choose(frame, a, b);
+  }
+
+  return { start, show, kept: () => kept.length };
 })();

@@ -267,7 +267,7 @@ def test_frames_and_methods_change_the_picture(chromium, study_file):
 
 def test_hovering_tells_disparity_error_and_depth(chromium, view_file):
     with opened(chromium, view_file) as page:
-        page.evaluate("document.getElementById('view-disparity').scrollIntoView({behavior: 'instant', block: 'center'})")
+        page.evaluate("document.getElementById('view-disparity').scrollIntoView({behavior: 'instant'})")
         box = page.locator("#view-disparity").bounding_box()
 
         def point(x, y):

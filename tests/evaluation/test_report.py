@@ -166,7 +166,7 @@ def test_the_figures_pair_by_pair():
         {"matcher": "mine", "setting": "peer", "name": "my own", "frames": [frame("q", None, 5, None)]},
         {"matcher": "S2", "setting": "Mini+CNN", "frames": []},
     ]
-    table = per_pair(rows, ["q"])
+    table = per_pair(rows, ["q"], digits=3)
     assert table["frames"] == ["p", "q"] and table["methods"] == ["S2 Original", "my own"]
     assert table["measures"] == {"D1 all, %": [[4.0, 6.0], [None, 5.0]], "EPE, px": [[1.0, 2.0], [None, None]]}
     assert table["viewer"] == {"q": 0}

@@ -27,6 +27,7 @@ from stereokit_evaluation.data.datasets import dataset_names, load_frames, selec
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.data.published import PAPER
 from stereokit_evaluation.data.splits import comparison, count_frames, split
+from stereokit_evaluation.report.exports import write_exports
 from stereokit_evaluation.scoring.runner import seen_in_training
 from stereokit_evaluation.study.configurations import available_variants, baseline, build, parse_variant
 from stereokit_evaluation.study.run import Study, run_study
@@ -150,6 +151,9 @@ def study(
         "versions": versions(),
         "machine": machine_info,
     }
+    write_json(make_folder(output) / "study.json", document)
+    if used:
+        write_exports(document, output)
     if not write_json(json_file, document):
         counts = document["frames_with_truth"]
         heading = f"{dataset}{'' if part is None else ', ' + part}, {count_frames(used)} (noc {counts['noc']}, "

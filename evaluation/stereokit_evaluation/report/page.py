@@ -81,7 +81,7 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
         title=f"Robustness study: {title}",
         document=document,
         rows=rows,
-        per_pair=per_pair(rows, [frame.name for frame in chosen]),
+        per_pair=per_pair(rows, [frame.name for frame in chosen], digits=3),
         methods=_first_methods(study.rows),
         regions=_charts.REGIONS,
         stages=(TOTAL, *GROUPS, OTHER),

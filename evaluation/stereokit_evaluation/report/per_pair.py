@@ -12,7 +12,9 @@ __all__ = ["per_pair"]
 _MEASURES = {"D1 noc, %": ("d1", "noc"), "D1 all, %": ("d1", "occ"), "EPE, px": ("epe",)}
 
 
-def per_pair(rows: Sequence[Mapping[str, Any]], viewer_frames: Sequence[str] = ()) -> dict[str, Any]:
+def per_pair(
+    rows: Sequence[Mapping[str, Any]], viewer_frames: Sequence[str] = (), digits: int | None = None
+) -> dict[str, Any]:
     """Return the figures by measure, method and pair.
 
     Parameters
@@ -21,6 +23,8 @@ def per_pair(rows: Sequence[Mapping[str, Any]], viewer_frames: Sequence[str] = (
         ``results`` of the study's JSON.
     viewer_frames : sequence of str
         The pairs that the page's viewer has, in its order.
+    digits : int, optional
+        Digits after the point, to keep a page small; None rounds nothing.
 
     Returns
     -------
@@ -34,7 +38,7 @@ def per_pair(rows: Sequence[Mapping[str, Any]], viewer_frames: Sequence[str] = (
     for measure, keys in _MEASURES.items():
         table = []
         for row in scored:
-            figures = {frame["name"]: _figure(frame, keys) for frame in row["frames"]}
+            figures = {frame["name"]: _figure(frame, keys, digits) for frame in row["frames"]}
             table.append([figures.get(name) for name in names])
         if any(value is not None for column in table for value in column):
             measures[measure] = table
@@ -42,8 +46,8 @@ def per_pair(rows: Sequence[Mapping[str, Any]], viewer_frames: Sequence[str] = (
     return {"frames": names, "methods": [row_name(row) for row in scored], "measures": measures, "viewer": places}
 
 
-def _figure(frame: Mapping[str, Any], keys: Sequence[str]) -> float | None:
+def _figure(frame: Mapping[str, Any], keys: Sequence[str], digits: int | None) -> float | None:
     value: Any = frame
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None
-    return None if value is None else round(float(value), 3)
+    return None if value is None else float(value) if digits is None else round(float(value), digits)

@@ -70,16 +70,16 @@ def submit(
     check_output(output, (".zip",), "output")
     submission = expected_frames(benchmark, root, part, resolution)
     if predictions is not None:
-        given: dict[str, Any] = {
+        conflicts: dict[str, Any] = {
             "method": method,
             "refiner": refiner,
             "weights": weights,
             "set": settings,
             "threads": threads,
         }
-        given |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
-        for option in (option for option, value in given.items() if value):
-            raise OptionError(f"{option} must not be set with predictions, got {given[option]!r}")
+        conflicts |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
+        for option in (option for option, value in conflicts.items() if value):
+            raise OptionError(f"{option} must not be set with predictions, got {conflicts[option]!r}")
         _check_maps(predictions, submission)
         estimate, time = from_files(predictions), _times(predictions, seconds)
     else:

@@ -89,14 +89,14 @@ def bars(rows: Sequence[JsonRow], figure: str, name: str) -> dict[str, Any]:
     cells = [(m, s) for m in matchers for s in variants if (m, s) in measured or s in paper.get(m, {})]
     labels = [f"{matcher} {title(variant)}" for matcher, variant in cells]
     colours = [colour(variant, variants) for _, variant in cells]
-    found: list[JsonRow | None] = [measured.get(cell) for cell in cells]
+    scored: list[JsonRow | None] = [measured.get(cell) for cell in cells]
     for row in rows:
         if row["setting"] == BASELINE and row["missing"] is None:
             labels.append(row_name(row))
             colours.append(_BASELINE_COLOUR)
-            found.append(row)
+            scored.append(row)
     printed = [paper.get(m, {}).get(s) for m, s in cells] + [None] * (len(labels) - len(cells))
-    values = {region: [None if row is None else _d1(row, region) for row in found] for region in REGIONS}
+    values = {region: [None if row is None else _d1(row, region) for row in scored] for region in REGIONS}
     hatched = {
         "color": colours,
         "pattern": {"shape": "/", "fgcolor": colours, "bgcolor": "rgba(0,0,0,0)", "size": 6},

@@ -27,7 +27,7 @@ from stereokit_evaluation.study.configurations import available_variants, baseli
 from stereokit_evaluation.study.regions import REGIONS, RegionRow, measure_regions
 from stereokit_evaluation.synthetic.scenes import generate
 
-__all__ = ["regions"]
+__all__ = ["regions", "scene_masks"]
 
 _DEFAULT_DISPARITIES = 128
 _HARD = ("textureless", "specular", "brightness")
@@ -72,7 +72,7 @@ def regions(
     if with_baselines:
         configurations += [baseline(key, levels) for key in (THREE_WAY, HH)]
     with progress(len(selected) * len(configurations)) as (_, step):
-        rows = measure_regions(selected, configurations, _scene_masks if dataset == "scenes" else None, step=step)
+        rows = measure_regions(selected, configurations, scene_masks if dataset == "scenes" else None, step=step)
     table = _table(rows, f"D1 error in percent by kind of pixel; {len(selected)} frames of {dataset}")
     if output is not None:
         make_folder(output)
@@ -85,7 +85,7 @@ def regions(
                 typer.echo(f"missing: {row.configuration.name}: {row.missing}")
 
 
-def _scene_masks(frame: Frame) -> Mapping[str, NDArray[np.bool_]]:
+def scene_masks(frame: Frame) -> Mapping[str, NDArray[np.bool_]]:
     """Return the hard regions of a scene, drawn once more by the number in its name."""
     height, width = frame.load_left().shape[:2]
     scene = generate(int(frame.name.rpartition("_")[2]), width, height)

@@ -12,10 +12,13 @@ import pytest
 from stereokit.errors import FileError
 from stereokit.matching import METHODS
 from stereokit_evaluation.commands import doc_figures
-from stereokit_evaluation.commands.doc_figures import Measurement, measure, measurements
+from stereokit_evaluation.commands.doc_figures import Measurement, measure, measurements, region_names
+from stereokit_evaluation.data import published
+from stereokit_evaluation.study.configurations import PAPER_VARIANTS
 
 ROOT = Path(__file__).parents[2]
 README, BENCHMARKS, INDEX = ROOT / "README.md", ROOT / "docs" / "benchmarks.md", ROOT / "docs" / "index.md"
+PAPER = ROOT / "docs" / "paper.md"
 FIGURES = json.loads((ROOT / "docs" / "figures.json").read_text(encoding="utf-8"))["figures"]
 BASELINES = {
     "OpenCV 5 SGBM, 3WAY": "OpenCV 3WAY",
@@ -28,6 +31,14 @@ REFINED = {
     "half size, cnn": " half cnn",
     "half size, stereovae (the paper's)": " half stereovae",
     "half size, pyramid": " half pyramid",
+}
+SETTINGS = {
+    "Mini+Linear": " half",
+    "Original": "",
+    "Mini+CNN": " half cnn",
+    "Mini+StereoVAE": " half stereovae",
+    "Mini+pyramid": " half pyramid",
+    "Mini+stereokit": " half stereokit",
 }
 BAD_2 = ("cones", "teddy", "Motorcycle")
 SENTENCES = [
@@ -76,6 +87,7 @@ def agree(text, key):
 
 def test_the_file_has_every_figure_and_no_other():
     names = [figure.name for figure in measurements()]
+    names += [name for dataset in ("scenes", "kitti2015") for name in region_names(dataset)]
     assert list(FIGURES) == names and len(set(names)) == len(names)
     assert all(0 < value < 100 for value in FIGURES.values())
 
@@ -103,6 +115,40 @@ def test_the_table_of_refiners(find):
     for name, suffix in REFINED.items():
         for method in METHODS:
             agree(first_number(rows[name][method]), f"kitti2015 validation, D1, {method}{suffix}")
+
+
+def key_of(row):
+    """Return a row's part of a key: ``"S4 Mini+CNN"`` is ``"S4 half cnn"``."""
+    method, _, setting = row.partition(" ")
+    return f"{method}{SETTINGS[setting]}" if setting in SETTINGS else row
+
+
+def test_the_table_of_the_paper(find):
+    rows = find(PAPER, "published, validation").rows
+    assert len(rows) == 4 * len(SETTINGS) + 2
+    names = {title: variant for variant, title in PAPER_VARIANTS.items()}
+    for name, cells in rows.items():
+        method, _, setting = name.partition(" ")
+        for column, part in (("validation, 11 frames", "kitti2015 validation"), ("all 34 frames", "kitti2015")):
+            key = f"{part}, D1, {key_of(name)}"
+            assert bool(cells[column]) == (key in FIGURES)
+            if cells[column]:
+                agree(cells[column], key)
+        for column, paper in (("published, validation", published.VALIDATION), ("published, test", published.TEST)):
+            value = paper.get(method, {}).get(names.get(setting, ""))
+            assert cells[column] == ("" if value is None else f"{value:.2f}")
+
+
+@pytest.mark.parametrize(("head", "dataset"), [("textureless", "scenes"), ("16 to 32 px", "kitti2015")])
+def test_the_tables_by_kind_of_pixel(find, head, dataset):
+    keys = region_names(dataset)
+    rows = find(PAPER, head).rows
+    for name, cells in rows.items():
+        for region, text in list(cells.items())[1:]:
+            key = f"{dataset} {region}, D1, {key_of(name)}"
+            assert key in keys
+            agree(text, key)
+    assert len(rows) * len(list(cells.items())[1:]) == len(keys)
 
 
 @pytest.mark.parametrize(("page", "pattern", "keys"), SENTENCES)
@@ -159,8 +205,10 @@ def test_the_command_writes_what_it_measures(tmp_path, monkeypatch, capsys):
     few = [Measurement("one", "kitti2015", None, "D1", "S2"), Measurement("two", "kitti2015", None, "D1", "S4")]
     monkeypatch.setattr(doc_figures, "measurements", lambda: iter(few))
     monkeypatch.setattr(doc_figures, "measure", lambda figure, data: {"one": 1.23456, "two": 2.0}[figure.name])
+    monkeypatch.setattr(doc_figures, "measure_by_region", lambda dataset, data: {f"{dataset} part": 3.00004})
     doc_figures.main(["--data", str(tmp_path), "-o", str(tmp_path / "figures.json")])
     document = json.loads((tmp_path / "figures.json").read_text())
-    assert document["figures"] == {"one": 1.2346, "two": 2.0} and "doc_figures" in document["command"]
+    assert document["figures"] == {"one": 1.2346, "two": 2.0, "scenes part": 3.0, "kitti2015 part": 3.0}
+    assert "doc_figures" in document["command"]
     with pytest.raises(FileError, match=r"output must end in one of \.json"):
         doc_figures.main(["--data", str(tmp_path), "-o", str(tmp_path / "figures.txt")])

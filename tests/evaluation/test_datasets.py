@@ -13,7 +13,7 @@ import pytest
 
 from stereokit.errors import FileError, OptionError, UnknownNameError
 from stereokit_evaluation.data import datasets
-from stereokit_evaluation.data.frame import Frame, select_frames
+from stereokit_evaluation.data.frame import Benchmark, Frame, select_frames
 
 DATA = Path(os.environ.get("STEREOKIT_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 NAN = np.nan
@@ -142,10 +142,41 @@ def test_pairs_with_calibration(tmp_path, make, truth):
     write(scene / "mask0nocc.png", np.uint8([[255, 255, 128], [0, 255, 255]]))
     (scene / "calib.txt").write_text("cam0=[1 0 2; 0 1 3; 0 0 1]\nndisp=70\nisint=0\n")
     (frame,) = make(tmp_path)
-    assert (frame.name, frame.max_disparity) == ("deep/room", 70)
+    assert (frame.name, frame.max_disparity) == ("deep/room", 70 if make is datasets.middlebury else 64)
+    assert frame.benchmark == Benchmark(make.__name__) and frame.scene == "deep/room"
     np.testing.assert_array_equal(frame.load_occ(), TRUTH)
     np.testing.assert_array_equal(frame.load_noc(), np.float32([[1.5, NAN, NAN], [NAN, 4.0, NAN]]))
     assert make(scene)[0].name == "room"
+
+
+def test_pairs_of_one_scene_and_whole_truth(tmp_path):
+    for name in ("H/PianoL", "H/Piano", "H/Teddy", "H/Middle"):
+        write(tmp_path / name / "im0.png", picture(1))
+        (tmp_path / name / "calib.txt").write_text(f"isint={int(name == 'H/Teddy')}\nndisp=128\n")
+    frames = {frame.name: frame for frame in datasets.middlebury(tmp_path)}
+    assert {name: frame.scene for name, frame in frames.items()} == {
+        "H/PianoL": "H/Piano", "H/Piano": "H/Piano", "H/Teddy": "H/Teddy", "H/Middle": "H/Middle",
+    }  # fmt: skip
+    assert [name for name, frame in frames.items() if frame.benchmark.integer] == ["H/Teddy"]
+    for name in ("delivery_area_1l", "delivery_area_3s", "forest_2s", "storage_room_2_1l"):
+        write(tmp_path / "two" / name / "im0.png", picture(1))
+    scenes = {frame.name: frame.scene for frame in datasets.eth3d(tmp_path / "two")}
+    assert scenes == {
+        "delivery_area_1l": "delivery_area", "delivery_area_3s": "delivery_area", "forest_2s": "forest",
+        "storage_room_2_1l": "storage_room_2",
+    }  # fmt: skip
+
+
+def test_drives_of_kitti(tmp_path):
+    for index in (0, 1, 9, 10, 14):
+        write(tmp_path / "training" / "image_2" / f"{index:06d}_10.png", picture(1))
+    blocks = [frame.scene for frame in datasets.kitti2015(tmp_path)]
+    assert blocks == ["000000-000009"] * 3 + ["000010-000019"] * 2
+    lines = ["2011_09_26 2011_09_26_drive_0005_sync 0000000010", "", *["d drive_7 1"] * 9]
+    (tmp_path / "devkit" / "mapping").mkdir(parents=True)
+    (tmp_path / "devkit" / "mapping" / "train_mapping.txt").write_text("\n".join(lines))
+    drives = [frame.scene for frame in datasets.kitti2015(tmp_path)]
+    assert drives == ["2011_09_26_drive_0005_sync", "000001_10", "drive_7", "drive_7", "000010-000019"]
 
 
 def test_a_scene_of_2001_with_all_its_views_is_one_frame(tmp_path):

@@ -27,6 +27,7 @@ from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.kitti import score
 from stereokit_evaluation.study import run as study_run
 from stereokit_evaluation.study.configurations import Configuration
+from stereokit_evaluation.study.data import parse_data
 from stereokit_evaluation.study.run import run_study
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
 from stereokit_evaluation.training import per_matcher
@@ -411,3 +412,138 @@ def test_measure_refuses_unequal_sizes(pairs):
     other = Frame("x", frame.left, lambda: np.zeros((3, 3), np.uint8), occ=frame.occ)
     with pytest.raises(InputError, match="one size"):
         study_run.measure(fake("A", lambda left: None), study_run._LoadedFrame(other, True), 1)
+
+
+def many(tmp_path, *words, status=0):
+    """Run the command on two folders; return its JSON."""
+    for name, count, shape in (("one", 2, (40, 96)), ("two", 3, (32, 80))):
+        if not (tmp_path / name).exists():
+            write_pairs(tmp_path / name, count, shape)
+    arguments = ["--data", f"folder:{tmp_path / 'one'}", "--data", f"folder:{tmp_path / 'two'}", "--json", "-"]
+    arguments += ["-o", tmp_path / "out", *SMALL, "--method", "S2", "--variant", "linear", "--variant", "original"]
+    done = CliRunner().invoke(APP, [str(word) for word in (*arguments, *words)])
+    assert done.exit_code == status, (done.output, done.exception)
+    return json.loads(done.stdout)
+
+
+def test_all_data_sets_in_one_run(tmp_path):
+    document = many(tmp_path)
+    one, two = document["data"]["folder"], document["data"]["folder-2"]
+    assert (one["frames"], two["frames"]) == (["000", "001"], ["000", "001", "002"])
+    assert document["frames"] == [f"folder/{n}" for n in ("000", "001")] + [f"folder-2/00{n}" for n in range(3)]
+    for index, row in enumerate(document["results"]):
+        parts = [data["results"][index] for data in (one, two)]
+        assert row["name"] == parts[0]["name"] and row["images"] == 5
+        assert row["figures"]["main"]["d1"] == pytest.approx(
+            sum(p["figures"]["main"]["d1"] * p["pixels"]["occ"] for p in parts) / row["pixels"]["occ"]
+        )
+        assert len(row["frames"]) == 5 and row["ms"]["total"] > 0
+    assert document["records"] == {"reused": 0, "computed": 10}
+    assert many(tmp_path)["records"] == {"reused": 10, "computed": 0}
+    assert "5 pairs" in document["pixels_line"] and "2 pairs" in one["pixels_line"]
+
+
+def test_the_json_has_all_measures_intervals_and_comparisons(tmp_path):
+    document = many(tmp_path)
+    row = document["data"]["folder-2"]["results"][1]
+    assert (row["name"], row["label"], row["variant"], row["kind"]) == ("S2 Original", "S2", "original", "stereokit")
+    assert set(row["figures"]) == {"main", "noc", "all", "occluded", "edges"}
+    frames = row["frames"]
+    assert sum(f["figures"]["epe"] for f in frames) / 3 == pytest.approx(row["figures"]["main"]["epe"])
+    assert sum(f["figures"]["a90"] for f in frames) / 3 == pytest.approx(row["figures"]["main"]["a90"])
+    low, high = row["intervals"]["epe"]
+    assert min(f["figures"]["epe"] for f in frames) - 1e-9 <= low <= row["figures"]["main"]["epe"] <= high
+    (entry,) = [c for c in document["data"]["folder-2"]["comparisons"] if c["figure"] == "epe"]
+    other = document["data"]["folder-2"]["results"][0]
+    assert (entry["first"], entry["second"], entry["scenes"]) == ("S2 Mini+Linear", "S2 Original", 3)
+    assert entry["difference"] == pytest.approx(other["figures"]["main"]["epe"] - row["figures"]["main"]["epe"])
+    assert entry["low"] <= entry["difference"] <= entry["high"] and 0.25 <= entry["p"] <= 1
+
+
+def test_frames_are_chosen_for_each_data_set(tmp_path):
+    document = many(tmp_path, "--frames", "folder:1", "--frames", "folder-2:0", "--frames", "folder-2:2")
+    assert document["frames"] == ["folder/001", "folder-2/000", "folder-2/002"]
+    assert many(tmp_path, "--frames", "0-1")["frames"] == [f"{d}/00{n}" for d in ("folder", "folder-2") for n in (0, 1)]
+    assert many(tmp_path, "--max-frames", "2")["frames"][2:] == ["folder-2/000", "folder-2/002"]
+
+
+def test_data_sets_have_names(tmp_path):
+    assert [(name, kind) for name, kind, _ in parse_data(["folder:a", "sat=folder:b", "folder:c", "scenes"])] == [
+        ("folder", "folder"), ("sat", "folder"), ("folder-3", "folder"), ("scenes", "scenes"),
+    ]  # fmt: skip
+    assert parse_data(["eth3d:C:/x y"]) == [("eth3d", "eth3d", Path("C:/x y"))]
+
+
+def test_others_have_rows_like_ours(pairs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine_for_study.py").write_text("def run(left, right):\n    return left * 0.0 + 4\n")
+    (tmp_path / "maps").mkdir()
+    for index in range(3):
+        write_disparity(tmp_path / "maps" / f"{index:03d}.pfm", np.full((32, 96), 4.0 + index % 3, np.float32))
+    script = "import sys, shutil; shutil.copy(sys.argv[4], sys.argv[3])"
+    line = f"Copy='{sys.executable}' -c '{script}' {{left}} {{right}} {{out}} {tmp_path / 'maps' / '000.pfm'}"
+    words = ("--method", "S2", "--variant", "original", "--method", "OpenCV SGBM", "--command", line)
+    words += ("--method", "mine_for_study:run", "--predictions", f"Net={tmp_path / 'maps'}")
+    document = run(pairs, tmp_path / "out", *words)
+    rows = {row["name"]: row for row in document["results"]}
+    assert [row["kind"] for row in rows.values()] == ["stereokit", "opencv", "function", "program", "maps"]
+    assert rows["Net"]["epe"] == 0 and rows["Net"]["ms"] == {}
+    assert rows["Copy"]["epe"] == rows["mine_for_study:run"]["epe"] == pytest.approx(1)
+    assert rows["Copy"]["ms"]["total"] > 0 and all(row["setting"] == "peer" for row in list(rows.values())[1:])
+    assert document["records"] == {"reused": 0, "computed": 15}
+    (tmp_path / "maps" / "other").mkdir()
+    write_disparity(tmp_path / "maps" / "001.pfm", np.full((32, 96), 9.0, np.float32))
+    again = run(pairs, tmp_path / "out", *words)
+    assert again["records"] == {"reused": 14, "computed": 1}  # a map that changed is scored again
+    (tmp_path / "maps" / "002.pfm").unlink()
+    document = run(pairs, tmp_path / "out", *words, status=1)
+    assert document["frames"] == ["000", "001"] and document["results"][-1]["failed"] == 1
+    assert "Net: no map 002.png, .pfm" in document["skipped"][0]["reason"]
+    table = command(pairs, tmp_path / "out", *words, "--frames", "0-1").stdout
+    assert "mine_for_study:run" in table and "Copy" in table and "RMSE" in table and "minus that of the best" in table
+
+
+def test_benchmarks_have_their_own_figures(tmp_path):
+    room = tmp_path / "data" / "room_1l"
+    room.mkdir(parents=True)
+    left = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (32, 96), dtype=np.uint8), (0, 0), 1)
+    for name, image in (("im0", left), ("im1", np.roll(left, -5, axis=1))):
+        assert cv2.imwrite(str(room / f"{name}.png"), image)
+    write_disparity(room / "disp0GT.pfm", np.full((32, 96), 5, np.float32))
+    mask = np.where(np.arange(96) > 8, 255, 128)[None].repeat(32, 0).astype(np.uint8)
+    assert cv2.imwrite(str(room / "mask0nocc.png"), mask)
+    words = ["--data", f"eth3d:{tmp_path / 'data'}", "-o", tmp_path / "out", *SMALL, "--method", "S2"]
+    done = CliRunner().invoke(APP, [str(word) for word in (*words, "--variant", "original", "--json", "-")])
+    document = json.loads(done.stdout)
+    row = document["data"]["eth3d"]["official"]["eth3d"]["S2 Original"]
+    assert row["average"]["dense"]["nonocc"]["coverage"] == 100 and row["average"]["dense"]["nonocc"]["bad-1"] < 1
+    assert row["frames"]["room_1l"]["dense"]["all"]["pixels"] == 32 * 96
+    assert document["data"]["eth3d"]["scenes"] == ["room"]
+    table = CliRunner().invoke(APP, [str(word) for word in (*words, "--variant", "original")]).stdout
+    assert "eth3d, its own rules, 1 pair" in table and "lower the coverage" in table
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--data", "folder"), "data must be NAME:DIR, got 'folder' without a folder"),
+        (("--data", "nothing:."), "data must be NAME:DIR with a name of kitti2015"),
+        (("--data", "x=folder:.", "--data", "x=folder:."), "data must have different names, got 'x' twice"),
+        (("--data", "a/b=folder:."), "data must have names of letters, digits"),
+        (("--data", "folder:.", "--root", "."), "dataset and root must not be set with data"),
+        (("--data", "folder:.", "--frames", "kitti:3"), "frames must be DATA:SELECTION with DATA one of folder"),
+        (("--data", "folder:.", "--data", "folder:.", "--train"), "train must go with one data set, got 2"),
+        (("--data", "folder:.", "--max-frames", "0"), "max_frames must be at least 1, got 0"),
+        (("--data", "folder:.", "--disturb-frames", "1"), "disturb_frames must go with disturb"),
+        (("--data", "folder:.", "--disturb", "fog"), "no disturbance named 'fog'"),
+        (("--data", "folder:.", "--disturb", "noise:x"), "disturb must be KIND:S1,S2 with numbers"),
+        (("--data", "folder:.", "--disturb", "noise:-1"), "noise must have strengths from 0 to 255"),
+        (("--data", "folder:.", "--predictions", "X=none"), "predictions must be a folder"),
+        (("--data", "folder:.", "--time-limit", "3"), "time_limit must go with command"),
+    ],
+)
+def test_bad_data_is_one_line_before_any_work(pairs, tmp_path, words, message, monkeypatch):
+    monkeypatch.chdir(pairs)
+    done = CliRunner().invoke(APP, [str(word) for word in (*words, "-o", tmp_path / "out", *SMALL)])
+    assert isinstance(done.exception, StereokitError), (done.output, done.exception)
+    assert message in str(done.exception) and "\n" not in str(done.exception) and not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""The command ``stereokit evaluate``: methods, or finished maps, scored on a data set in one table.
+"""The command ``stereokit evaluate``: methods, programs and finished maps, scored on a data set in one table.
 
 Scores are those of the KITTI 2015 development kit (`stereokit_evaluation.scoring.kitti`), pooled over images. A
 column counts only the images that have its ground truth. For scripts there is `run`.
@@ -22,12 +22,14 @@ from stereokit.cli.options import DeviceOption, JsonOption, WeightsOption, check
 from stereokit.cli.output import Table
 from stereokit.errors import OptionError, one_line
 from stereokit.io import write_image
+from stereokit_evaluation.bench.baselines import padded
 from stereokit_evaluation.common.folders import make_folder
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.common.weights import check_weights, weights_option
 from stereokit_evaluation.data.datasets import dataset_names, load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.error_map import error_map
+from stereokit_evaluation.scoring.outside import MapFolder, OutsideMethod, is_function, outside_methods
 from stereokit_evaluation.scoring.runner import (
     Estimate,
     Estimator,
@@ -39,8 +41,10 @@ from stereokit_evaluation.scoring.runner import (
     score_frames,
     seen_in_training,
     with_matcher,
+    with_outside,
 )
-from stereokit_evaluation.scoring.summary import summary
+from stereokit_evaluation.scoring.summary import pixels_line, summary
+from stereokit_evaluation.study.configurations import baseline_key
 
 __all__ = ["Result", "evaluate", "run"]
 
@@ -59,22 +63,34 @@ class _Run:
     refiner: str | None = None
     device: str | None = None
     matcher: Any = None
+    kind: str = "stereokit"
 
     @property
     def folder(self) -> str:
         """The unique name of the folder of its pictures."""
-        return self.method if self.refiner is None else f"{self.method}-{Path(self.refiner).name}"
+        name = self.method.replace("/", "_").replace(":", "_")
+        return name if self.refiner is None else f"{name}-{Path(self.refiner).name}"
 
 
 def evaluate(
     dataset: Annotated[str, typer.Option(help=f"One of {', '.join(dataset_names())}.")],
     root: Annotated[Path | None, typer.Option(help="Folder of the data set (none for scenes).")] = None,
     frames: Annotated[str | None, typer.Option(help="Numbers or names, such as 0-3,34-40.")] = None,
-    method: Annotated[list[str] | None, typer.Option(help="cost+aggregation or S1-S4; may repeat.")] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(help="S1-S4, cost+aggregation, 'OpenCV HH', or a function [NAME=]module:function; may repeat."),
+    ] = None,
     scale: Annotated[float, typer.Option(help="1, or 0.5 or 0.25 to match at a smaller size.")] = 1.0,
     refiner: Annotated[list[str] | None, typer.Option(help="Refiner of the map; may repeat.")] = None,
     weights: WeightsOption = None,
-    predictions: Annotated[Path | None, typer.Option(help="Score NAME.png, .pfm, .npy from here.")] = None,
+    predictions: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[NAME=]DIR", help="Score the maps FRAME.png, .pfm, .npy from here; may repeat."),
+    ] = None,
+    command: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=LINE", help="A program: prog {left} {right} {out}; may repeat.")
+    ] = None,
+    time_limit: Annotated[float | None, typer.Option(help="Seconds that a program may take for a pair.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of the matcher.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="Stage option key=value; may repeat.")] = None,
     max_disparity: Annotated[int | None, typer.Option(help="Disparities; default by data set.")] = None,
@@ -90,32 +106,28 @@ def evaluate(
     """
     check_json(json_file)
     selected = select_frames(load_frames(dataset, root, count=count), frames)
-    options: dict[str, Any]
-    if predictions is not None:
-        conflicts: dict[str, Any] = {
-            "method": method,
-            "refiner": refiner,
-            "weights": weights,
-            "set": settings,
-            "threads": threads,
-        }
-        conflicts |= {"max_disparity": max_disparity, "scale": None if scale == 1.0 else scale}
-        for name in (name for name, value in conflicts.items() if value is not None and value != []):
-            raise OptionError(f"{name} must not be set with predictions, got {conflicts[name]!r}")
-        options = {"predictions": str(predictions)}
-        runs = [_Run(from_files(predictions), "predictions")]
-    else:
-        suggested = [frame.max_disparity for frame in selected if frame.max_disparity is not None]
-        if max_disparity is None:
-            max_disparity = max(suggested, default=_DEFAULT_DISPARITIES)
-        options = {"max_disparity": max_disparity, "threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
-        methods = method or [_DEFAULT_METHOD]
-        check_weights(refiner or (), weights)
-        runs = [
-            _matcher_run(name, scale, refine, device, options | weights_option(refine, weights), color)
-            for name in methods
-            for refine in (dict.fromkeys(refiner) if refiner else (None,))
-        ]
+    chosen = method or ([] if predictions or command else [_DEFAULT_METHOD])
+    functions = [text for text in chosen if is_function(text)]
+    modes = [key for text in chosen if text not in functions and (key := baseline_key(text)) is not None]
+    ours = [text for text in chosen if text not in functions and baseline_key(text) is None]
+    own: dict[str, Any] = {"refiner": refiner, "weights": weights, "set": settings, "threads": threads}
+    own["scale"] = None if scale == 1.0 else scale
+    for name in (name for name, value in own.items() if value is not None and value != [] and not ours):
+        raise OptionError(f"{name} must go with a method of ours, got {own[name]!r} without one")
+    suggested = [frame.max_disparity for frame in selected if frame.max_disparity is not None]
+    levels = max(suggested, default=_DEFAULT_DISPARITIES) if max_disparity is None else max_disparity
+    others = outside_methods(functions, command or (), predictions or (), max_disparity=levels, time_limit=time_limit)
+    stage_options = {"threads": threads, **parse_settings(settings or (), _OWN_OPTIONS)}
+    options: dict[str, Any] = {"max_disparity": levels, **stage_options}
+    check_weights(refiner or (), weights)
+    runs = [
+        _matcher_run(name, scale, refine, device, options | weights_option(refine, weights), color)
+        for name in ours
+        for refine in (dict.fromkeys(refiner) if refiner else (None,))
+    ]
+    runs += [_Run(with_matcher(padded(key, levels)), key, kind="opencv") for key in dict.fromkeys(modes)]
+    runs += [_outside_run(other) for other in others]
+    options |= {} if not predictions else {"predictions": [str(place) for place in predictions]}
     notes = (seen_in_training(job.matcher, dataset, selected) for job in runs)
     for line in dict.fromkeys(line for line in notes if line is not None):
         typer.echo(f"note: {line}", err=True)
@@ -131,6 +143,8 @@ def evaluate(
     }
     if not write_json(json_file, document):
         _print_table(f"{dataset}, {len(selected)} frames", runs, results)
+        if results and results[0].frames:
+            typer.echo(pixels_line(results[0]))
     if interrupted:
         raise typer.Exit(130)
     if skipped:
@@ -145,6 +159,11 @@ def _matcher_run(
     matcher = Matcher(method, scale=scale, refiner=refiner, device=device, **options)
     estimate = with_matcher(matcher, gray=not color)
     return _Run(estimate, str(matcher.method), scale, refiner, str(matcher.device), matcher)
+
+
+def _outside_run(method: OutsideMethod) -> _Run:
+    estimate = from_files(method.folder) if isinstance(method, MapFolder) else with_outside(method)
+    return _Run(estimate, method.name, kind=method.kind)
 
 
 def _execute(runs: Sequence[_Run], frames: Sequence[Frame], maps: Path | None) -> tuple[list[Result], bool]:
@@ -192,22 +211,21 @@ def _draws(folder: Path) -> Callable[..., None]:
 def _print_table(title: str, runs: Sequence[_Run], results: Sequence[Result]) -> None:
     table = Table(title=title, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column("method", no_wrap=True)
-    heads = ("images", "D1 noc", "bg", "fg", "D1 occ", "bad-2", "EPE", "density", "ms")
+    heads = ("images", "D1 noc", "bg", "fg", "D1 occ", "bad-1", "bad-2", "EPE", "RMSE", "A90", "density", "ms")
     for head in heads:
         table.add_column(head, justify="right")
     for job, result in zip(runs, results, strict=False):
-        noc, occ, main = result.score.noc, result.score.occ, result.score.main
+        noc, occ = result.score.noc, result.score.occ
         seconds = result.seconds_per_image
         figures = (
             *(part.filled.d1() for part in (noc.all, noc.bg, noc.fg, occ.all)),
-            main.filled.bad_x(2.0),
-            main.filled.epe(),
+            *(result.measures.main.figure(name) for name in ("bad-1", "bad-2", "epe", "rmse", "a90")),
         )
         table.add_row(
             " ".join(str(word) for word in (job.method, job.refiner, _half(job.scale)) if word),
             str(len(result.frames)),
             *("-" if figure is None else f"{figure:.2f}" for figure in figures),
-            "-" if (density := main.density()) is None else f"{density:.1f}",
+            "-" if (density := result.measures.main.figure("density")) is None else f"{density:.1f}",
             "-" if seconds is None else f"{1000 * seconds:.1f}",
         )
     Console(width=None if sys.stdout.isatty() else 120).print(table)
@@ -219,5 +237,5 @@ def _half(scale: float | None) -> str:
 
 def _as_json(job: _Run, result: Result) -> dict[str, Any]:
     """Return one entry of ``results``."""
-    entry = {"method": job.method, "scale": job.scale, "refiner": job.refiner, "device": job.device}
+    entry = {"method": job.method, "scale": job.scale, "refiner": job.refiner, "device": job.device, "kind": job.kind}
     return {**entry, **summary(result)}

@@ -26,8 +26,10 @@ from stereokit import Matcher
 from stereokit.notices import collecting
 from stereokit.pairs import KINDS, check_pair
 from stereokit_evaluation.data.datasets import Frame, eth3d, folder, kitti2012, kitti2015, middlebury
+from stereokit_evaluation.synthetic.disturbances import warped
+from stereokit_evaluation.synthetic.sensors import compressed
 
-__all__ = ["Case", "cases", "good_pairs", "main", "warped"]
+__all__ = ["Case", "cases", "good_pairs", "main"]
 
 _SETS = {
     "kitti2015": kitti2015, "kitti2012": kitti2012, "eth3d": eth3d, "middlebury": middlebury, "satellite": folder,
@@ -48,18 +50,6 @@ class Case:
     right: Gray
     min_disparity: int = 0
     max_disparity: int = _MAX_DISPARITY
-
-
-def warped(image: Gray, offset: float = 0.0, roll: float = 0.0) -> Gray:
-    """Return an image moved down by `offset` pixels and turned clockwise by `roll` degrees about its middle."""
-    height, width = image.shape
-    cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
-    x, y = (width - 1) / 2, (height - 1) / 2
-    matrix = np.array([[cos, -sin, x - cos * x + sin * y], [sin, cos, y - sin * x - cos * y + offset]])
-    size = width, height
-    return np.asarray(
-        cv2.warpAffine(image, matrix, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), np.uint8
-    )
 
 
 def good_pairs(data: Path) -> Iterator[tuple[str, Gray, Gray]]:
@@ -94,8 +84,7 @@ def cases(left: Gray, right: Gray, other: Gray) -> Iterator[Case]:
     yield case("exchanged", "exchanged", right, left)
     yield case("both upside down", "exchanged", left[::-1, ::-1], right[::-1, ::-1])
     yield case("one view twice", "same", left, left)
-    _, coded = cv2.imencode(".jpg", left, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    yield case("one view twice, one as JPEG", "same", left, cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
+    yield case("one view twice, one as JPEG", "same", left, compressed(left, 80))
     yield case("another scene", "unrelated", left, cv2.resize(other, left.shape[::-1]))
     yield case("2.2 times as bright", "exposure", left, np.clip(right * 2.2, 0, 255))
     yield case("2.2 times as dark", "exposure", left, right / 2.2)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stereokit.calibration import Calibration, read_calibration
 from stereokit.errors import FileError, OptionError, UnknownNameError, did_you_mean
 from stereokit.io import DISPARITY_SUFFIXES, READABLE_SUFFIXES, read_disparity, read_image, read_text
-from stereokit_evaluation.data.frame import Frame, Loader, select_frames
+from stereokit_evaluation.data.frame import Benchmark, Frame, Loader, select_frames
 
 __all__ = [
     "DATASETS",
@@ -42,7 +42,12 @@ _LEVELS = {"2001": 8, "2003": 4, "2006": 3}  # levels a pixel in the 8-bit dispa
 _WIDEST = {"2001": 1000, "2003": 450, "2006": 480}  # a wider image is of a larger edition, with other levels
 _SCENE_SIZE = (640, 384)  # width, height
 _MAPS = (*DISPARITY_SUFFIXES, ".tif")
-
+_ETH3D_DISPARITIES = 64  # its calibrations name the width of the image; true disparities are well below this
+_NEIGHBOURS = 10  # frames of KITTI with numbers next to each other, taken for one drive
+_VARIANTS = {
+    "middlebury": r"\b(Motorcycle|Piano|Playtable)[ELP]$",  # other exposure, light or rectification of one scene
+    "eth3d": r"(.)_[0-9]+[ls]$",  # several pairs of one scene
+}
 
 DATASETS: dict[str, Callable[[str | Path], list[Frame]]] = {}
 """The data sets that live in a folder, by the names that the command line uses."""
@@ -93,7 +98,7 @@ def middlebury(root: str | Path) -> list[Frame]:
     when they are loaded.
     """
     base = _root(root)
-    frames = [*_with_calibration(base)]
+    frames = [*_with_calibration(base, "middlebury")]
     for path in _images_below(base):
         if path.stem == "im2":
             modern = path.parent.name.lower() in ("cones", "teddy") or "2003" in path.parts
@@ -106,9 +111,13 @@ def middlebury(root: str | Path) -> list[Frame]:
 
 @data_set
 def eth3d(root: str | Path) -> list[Frame]:
-    """Return the ETH3D pairs below `root`: ``im0.png``, ``im1.png``, ``disp0GT.pfm``, ``mask0nocc.png``."""
+    """Return the ETH3D pairs below `root`: ``im0.png``, ``im1.png``, ``disp0GT.pfm``, ``mask0nocc.png``.
+
+    The ``ndisp`` of its calibrations is about the width of the image and no range to search: 64 at most are suggested.
+    """
     base = _root(root)
-    return _sorted_frames("ETH3D", [*_with_calibration(base)], base, "folders with im0.png, im1.png, disp0GT.pfm")
+    frames = [*_with_calibration(base, "eth3d")]
+    return _sorted_frames("ETH3D", frames, base, "folders with im0.png, im1.png, disp0GT.pfm")
 
 
 @data_set
@@ -214,6 +223,7 @@ def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth
     base = top / "training" if (top / "training").is_dir() else top
     a, b = next((pair for pair in pairs if (base / pair[0]).is_dir()), pairs[0])
     noc, occ, objects = (base / part for part in truth)
+    drives = _kitti_drives(base)
     # A frame with any existing part is listed, so that its missing parts are reported.
     names = {path.stem for part in (base / a, base / b, noc, occ) for path in part.glob("*_10.png")}
     frames = [
@@ -226,11 +236,40 @@ def _kitti(title: str, root: str | Path, pairs: Sequence[tuple[str, str]], truth
             objects=_lazy(read_image, _existing(objects / f"{name}.png")),
             max_disparity=_KITTI_DISPARITIES,
             calibration=_kitti_calibration(base, name, (2, 3) if a != "image_0" else (0, 1)),
+            scene=_kitti_scene(name, drives),
         )
         for name in names
     ]
     wanted = f"[training/]{a}/*_10.png, {b}/*_10.png, {truth[0]}/*_10.png, {truth[1]}/*_10.png"
     return _sorted_frames(title, frames, top, wanted)
+
+
+def _kitti_drives(base: Path) -> list[str]:
+    """Return the drive of each training frame by number, of the development kit's ``train_mapping.txt`` if it is there.
+
+    An empty text stands for a frame whose drive it does not name.
+    """
+    places = (place / part for place in (base, base.parent) for part in ("mapping", "devkit/mapping", "."))
+    path = next((path for place in places if (path := place / "train_mapping.txt").is_file()), None)
+    if path is None:
+        return []
+    words = [line.split() for line in read_text(path, "mapping").splitlines()]
+    return [line[1] if len(line) > 1 else "" for line in words]
+
+
+def _kitti_scene(name: str, drives: Sequence[str]) -> str:
+    """Return the drive of a frame; without a mapping, the block of `_NEIGHBOURS` numbers that it is in.
+
+    Frames with neighbouring numbers mostly are of one drive, often a second apart.
+    """
+    text = name.partition("_")[0]
+    if not text.isdecimal() or len(text) > 18:
+        return name
+    number = int(text)
+    if number < len(drives):
+        return drives[number] or name
+    first = number - number % _NEIGHBOURS
+    return f"{first:06d}-{first + _NEIGHBOURS - 1:06d}"
 
 
 def _kitti_calibration(base: Path, name: str, cameras: tuple[int, int]) -> Callable[[], Calibration] | None:
@@ -240,7 +279,7 @@ def _kitti_calibration(base: Path, name: str, cameras: tuple[int, int]) -> Calla
     return None if path is None else partial(read_calibration, path, cameras)
 
 
-def _with_calibration(base: Path) -> Iterator[Frame]:
+def _with_calibration(base: Path, benchmark: str) -> Iterator[Frame]:
     """Yield the pairs in the layout of Middlebury since 2014 and of ETH3D."""
     for left in _images_below(base):
         scene = left.parent
@@ -248,14 +287,20 @@ def _with_calibration(base: Path) -> Iterator[Frame]:
             continue
         truth = next((path for name in ("disp0GT.pfm", "disp0.pfm") if (path := scene / name).exists()), None)
         occ, mask = _lazy(read_disparity, truth), _existing(scene / "mask0nocc.png")
+        name, fields = _name(base, scene), _fields(scene / "calib.txt")
+        levels = _ndisp(fields)
+        if benchmark == "eth3d" and levels is not None:
+            levels = min(levels, _ETH3D_DISPARITIES)
         yield Frame(
-            _name(base, scene),
+            name,
             left,
             _sibling(scene, "im1") or scene / "im1.png",
             noc=None if occ is None or mask is None else partial(_masked, occ, mask),
             occ=occ,
-            max_disparity=_ndisp(scene / "calib.txt"),
+            max_disparity=levels,
             calibration=partial(read_calibration, path) if (path := scene / "calib.txt").exists() else None,
+            scene=re.sub(_VARIANTS[benchmark], r"\1", name),
+            benchmark=Benchmark(benchmark, integer=fields.get("isint", "").strip() == "1"),
         )
 
 
@@ -294,14 +339,18 @@ def _masked(load_map: Loader, mask: Path) -> NDArray[np.float32]:
     return np.where(seen == 255, disparity, np.float32(np.nan))
 
 
-def _ndisp(path: Path) -> int | None:
-    """Return ``ndisp``, the number of disparities, of a calibration file, None if it has none."""
+def _fields(path: Path) -> dict[str, str]:
+    """Return the ``name=value`` lines of a calibration file, none of a file that cannot be read."""
     try:
         lines = read_text(path, "calibration").splitlines()
     except FileError:  # reported when the calibration itself is read
-        return None
-    values = dict(line.strip().partition("=")[::2] for line in lines)
-    text = re.fullmatch(r"\s*([1-9][0-9]{0,5})(?:\.0*)?\s*", values.get("ndisp", ""))
+        return {}
+    return dict(line.strip().partition("=")[::2] for line in lines)
+
+
+def _ndisp(fields: dict[str, str]) -> int | None:
+    """Return ``ndisp``, the number of disparities, None if there is none."""
+    text = re.fullmatch(r"\s*([1-9][0-9]{0,5})(?:\.0*)?\s*", fields.get("ndisp", ""))
     return int(text[1]) if text else None
 
 

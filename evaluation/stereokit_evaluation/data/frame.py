@@ -16,10 +16,25 @@ from stereokit.calibration import Calibration
 from stereokit.errors import OptionError
 from stereokit.io import read_image, read_pair
 
-__all__ = ["Frame", "Loader", "select_frames"]
+__all__ = ["Benchmark", "Frame", "Loader", "select_frames"]
 
 Loader = Callable[[], NDArray[Any]]
 """A function without arguments that returns an image or a map."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """The benchmark whose own rules score a pair too.
+
+    Parameters
+    ----------
+    name : {"middlebury", "eth3d"}
+    integer : bool
+        The true disparities are whole pixels.
+    """
+
+    name: str
+    integer: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,10 @@ class Frame:
         Disparities to search for this pair, None if the data set has no number.
     calibration : callable, optional
         Function that returns the cameras' geometry; None where it is not known.
+    scene : str, optional
+        The scene or drive that the pair is of: pairs of one scene are not independent. The name by default.
+    benchmark : Benchmark, optional
+        The benchmark that it belongs to, if that has rules of its own.
     """
 
     name: str
@@ -49,6 +68,8 @@ class Frame:
     objects: Loader | None = None
     max_disparity: int | None = None
     calibration: Callable[[], Calibration] | None = None
+    scene: str | None = None
+    benchmark: Benchmark | None = None
 
     def load_left(self, *, gray: bool = False) -> NDArray[Any]:
         """Return the left image, (H, W) or (H, W, 3) RGB, in its stored type."""

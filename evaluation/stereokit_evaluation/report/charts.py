@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stereokit_evaluation.data import published
+from stereokit_evaluation.report.disturbance_charts import disturbance_charts
 from stereokit_evaluation.study.configurations import BASELINE, PAPER_VARIANTS, title
 
 __all__ = ["REGIONS", "accuracy_time", "bars", "colour", "figures", "row_name", "symbol"]
@@ -34,6 +35,7 @@ _SYMBOLS = {"linear": "triangle-up", "original": "circle", "cnn": "pentagon", "s
 _OTHER_SYMBOLS = ("triangle-down", "hexagon", "cross", "x", "hourglass", "bowtie")
 _TICKS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000]
 _BASELINE_COLOUR = "#8a8a8a"
+_FEW_LINES = 8  # whose names fit beside them
 _ROW_PX, _FRAME_PX = 30, 110  # height of a row of bars, and of axis and legend
 
 JsonRow = Mapping[str, Any]
@@ -42,11 +44,25 @@ JsonRow = Mapping[str, Any]
 def figures(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return all charts of a study's JSON, by the id of the element of the page that they go to."""
     rows = document["results"]
-    return {
+    charts = {
         "chart-e4": bars(rows, "e4", document["dataset"]),
         "chart-e5": bars(rows, "e5", document["dataset"]),
         "chart-time": accuracy_time(rows),
     }
+    faults = disturbance_charts(document.get("disturbances") or {})
+    return charts | {f"chart-fault-{kind}": _named_lines(kind, chart) for kind, chart in faults.items()}
+
+
+def _named_lines(kind: str, chart: dict[str, Any]) -> dict[str, Any]:
+    """Return a chart of lines with a title, its legend on top, and names at the lines' ends if they are few."""
+    layout = {**chart["layout"], "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom"}}
+    traces = chart["data"]
+    if len(traces) <= _FEW_LINES:
+        traces = [
+            {**trace, "mode": f"{trace['mode']}+text", "text": [None] * (len(trace["x"]) - 1) + [trace["name"]]}
+            for trace in traces
+        ]
+    return {**chart, "data": traces, "layout": layout, "title": f"Error against {kind}"}
 
 
 def row_name(row: JsonRow) -> str:

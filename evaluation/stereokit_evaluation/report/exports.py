@@ -15,6 +15,7 @@ from stereokit_evaluation.report.tables import study_tables
 
 __all__ = ["write_exports"]
 
+_LONG = ("pairs", "measures_by_pixels", "comparisons")  # tables for programs, as CSV alone
 _NAMES = {"chart-e4": "d1_validation", "chart-e5": "d1_test", "chart-time": "accuracy_time"}
 
 
@@ -41,7 +42,7 @@ def write_exports(document: Mapping[str, Any], folder: Path) -> list[Path]:
     files: dict[Path, bytes] = {}
     for name, table in study_tables(document).items():
         files[folder / "tables" / f"{name}.csv"] = table.csv().encode()
-        if name != "pairs":  # long: for programs
+        if not name.endswith(_LONG):
             files[folder / "tables" / f"{name}.tex"] = table.latex().encode()
             files[folder / "tables" / f"{name}.md"] = table.markdown().encode()
     for key, figure in figures(document).items():

@@ -29,6 +29,7 @@ from stereokit_evaluation.data import published
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.report import charts as _charts
 from stereokit_evaluation.report import viewer
+from stereokit_evaluation.report.disturbance_charts import FIGURE_TITLES
 from stereokit_evaluation.report.per_pair import per_pair
 from stereokit_evaluation.report.tiles import TileFolder, json_text
 from stereokit_evaluation.scoring.runner import Scored
@@ -84,6 +85,8 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
         per_pair=per_pair(rows, [frame.name for frame in chosen], digits=3),
         methods=_first_methods(study.rows),
         regions=_charts.REGIONS,
+        disturbances=document.get("disturbances") or {},
+        fault_figures=FIGURE_TITLES,
         stages=(TOTAL, *GROUPS, OTHER),
         missing=missing_lines(study.rows),
         published=published,
@@ -180,13 +183,12 @@ def _share(counts: Sequence[int]) -> float:
 
 def _viewer_pair(frame: Frame, rows: Sequence[StudyRow]) -> dict[str, Any]:
     """Match a frame once more with every configuration, for the viewer."""
-    left, right = frame.load_left(gray=True), frame.load_right(gray=True)
     maps = []
     for row in rows:
         scored = next((candidate for candidate in row.result.frames if candidate.name == frame.name), None)
-        if row.configuration.matcher is not None and scored is not None:
+        if row.configuration.can_match and scored is not None:
             with collecting():  # reported when it was scored
-                result = row.configuration.matcher(left, right)
+                result = row.configuration.match_frame(frame)
             disparity, valid = np.asarray(result.disparity), np.asarray(result.valid)
             maps.append(viewer.MethodMap(row.configuration.name, disparity, valid, _note(scored)))
     return viewer.pair(
@@ -210,7 +212,7 @@ def _note(scored: Scored) -> str:
 
 def _pixels(frames: Sequence[Frame], rows: Sequence[StudyRow]) -> int:
     """Return how many pixels of maps the viewer shows, taking all frames for as large as the first."""
-    maps = sum(row.configuration.matcher is not None and row.missing is None for row in rows)
+    maps = sum(row.configuration.can_match and row.missing is None for row in rows)
     size = int(np.prod(frames[0].load_left().shape[:2])) if frames else 0
     return len(frames) * maps * size
 

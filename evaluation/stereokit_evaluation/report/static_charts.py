@@ -27,7 +27,9 @@ _MARKERS = {
     "circle": "o", "square": "s", "diamond": "D", "triangle-up": "^", "triangle-down": "v", "pentagon": "p",
     "star": "*", "hexagon": "h", "cross": "P", "x": "X", "hourglass": "d", "bowtie": "8",
 }  # fmt: skip
-_DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
+_DASHES = {
+    "solid": "-", "dash": "--", "dot": ":", "dashdot": "-.", "longdash": (0, (8, 3)), "longdashdot": (0, (8, 3, 1, 3)),
+}  # fmt: skip
 _SETTINGS = {
     "svg.fonttype": "none",
     "svg.hashsalt": "stereokit",
@@ -47,7 +49,7 @@ Figure = Mapping[str, Any]
 
 
 def chart_table(figure: Figure) -> Table:
-    """Return the numbers of a chart: a row for each of its points, and for each region where it has several."""
+    """Return the numbers of a chart: a row for each of its points, and for each region or figure that it can show."""
     by_region = figure.get("variants") or {}
     ((key, regions),) = by_region.items() if by_region else (("", {"": ()}),)
     rows = []
@@ -62,7 +64,11 @@ def chart_table(figure: Figure) -> Table:
                     rows.append((trace.get("name", ""), text, region or None, x, y))
     axes = [(name, figure["layout"].get(f"{name}axis", {}).get("title", {}).get("text")) for name in ("x", "y")]
     heads = [text or ("method" if figure["data"][0]["type"] == "bar" else name) for name, text in axes]
-    columns = (Column("series", None), Column("label", None), Column("pixels", None), *(Column(h, None) for h in heads))
+    shows_figures = key != "" and not any(" " in region for region in regions)  # regions have two words
+    if shows_figures:
+        heads[1] = "value"
+    shown = Column("figure" if shows_figures else "pixels", None)
+    columns = (Column("series", None), Column("label", None), shown, *(Column(head, None) for head in heads))
     return Table(figure.get("title", ""), columns, tuple(rows))
 
 
@@ -168,6 +174,8 @@ def _lay_out(axes: Any, layout: Figure, bars: bool) -> None:
         if title := axis.get("title", {}).get("text"):
             getattr(axes, f"set_{name}label")(title)
         limits = getattr(axes, f"get_{name}lim")
+        if axis.get("autorange") == "reversed" and not bars:
+            getattr(axes, f"invert_{name}axis")()
         if bars and name == "x":  # the page's range has room for all regions
             axes.set_xlim(0, 1.05 * limits()[1])
         elif "range" in axis and axis.get("type") != "log":
@@ -175,7 +183,7 @@ def _lay_out(axes: Any, layout: Figure, bars: bool) -> None:
         elif axis.get("rangemode") == "tozero":
             getattr(axes, f"set_{name}lim")(0, limits()[1])
         if "tickvals" in axis:
-            low, high = limits()
+            low, high = sorted(limits())
             ticks = [(value, str(text)) for value, text in zip(axis["tickvals"], axis["ticktext"], strict=True)]
             ticks = [(value, text) for value, text in ticks if low <= value <= high]
             getattr(axes, f"set_{name}ticks")([value for value, _ in ticks], labels=[text for _, text in ticks])

@@ -39,11 +39,14 @@ class Column:
         Digits after the point in LaTeX and Markdown; None is a column of text.
     best : bool
         Print the smallest figure in bold.
+    printed : bool
+        Have it in LaTeX and Markdown too, and not in CSV alone.
     """
 
     head: str
     digits: int | None = 2
     best: bool = False
+    printed: bool = True
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,9 @@ class Table:
         return "\n".join([*lines, ""])
 
     def _used(self) -> list[Column]:
-        """Return the columns that have anything in them."""
-        return [c for k, c in enumerate(self.columns) if not self.rows or any(row[k] is not None for row in self.rows)]
+        """Return the columns to print: those that have anything in them."""
+        filled = [not self.rows or any(row[k] is not None for row in self.rows) for k in range(len(self.columns))]
+        return [column for column, there in zip(self.columns, filled, strict=True) if there and column.printed]
 
     def _texts(self, form: str) -> list[list[tuple[str, bool]]]:
         """Return the cells of the used columns as rounded texts, and whether each is the best of its column."""
@@ -149,7 +153,55 @@ def study_tables(document: Mapping[str, Any]) -> dict[str, Table]:
         (*names, *(Column(stage, 1) for stage in stages), Column("published AGX Xavier")),
         tuple((*_names(row), *map(row["ms"].get, stages), row["published"]["agx_ms"]) for row in rows),
     )
-    return {"accuracy": accuracy, "bad_pixels": bad, "times": times, "pairs": _pairs(rows, count)}
+    tables = {"accuracy": accuracy, "bad_pixels": bad, "times": times, "pairs": _pairs(rows, count)}
+    if any(row.get("figures") for row in rows):
+        tables |= {"measures": _measures(rows, count), "measures_by_pixels": _by_pixels(rows, count)}
+    if entries := document.get("comparisons"):
+        tables["comparisons"] = _comparisons(entries, count)
+    parts = document.get("data") or {}
+    for part, content in parts.items() if len(parts) > 1 else ():
+        whole = study_tables({**document, **content, "dataset": part, "data": {}})
+        tables |= {f"{re.sub(r'[^A-Za-z0-9_-]', '_', part)}_{key}": table for key, table in whole.items()}
+    return tables
+
+
+def _measures(rows: Sequence[Mapping[str, Any]], count: str) -> Table:
+    """Return the figures of the main pixels; CSV has their bootstrap intervals too."""
+    names = list(next(row["figures"]["main"] for row in rows if row.get("figures")))
+    ends = [(name, end) for name in names for end in (0, 1)]
+    columns = (
+        Column("matcher", None),
+        Column("setting", None),
+        *(Column(name, best=name != "density") for name in names),
+        *(Column(f"{name} {('low', 'high')[end]}", printed=False) for name, end in ends),
+    )
+    cells = []
+    for row in rows:
+        figures, intervals = row.get("figures", {}).get("main", {}), row.get("intervals") or {}
+        limits = [None if intervals.get(name) is None else intervals[name][end] for name, end in ends]
+        cells.append((*_names(row), *map(figures.get, names), *limits))
+    title = f"figures of the pixels that both cameras see, where that is known, else of all; {count}"
+    return Table(title, columns, tuple(cells))
+
+
+def _by_pixels(rows: Sequence[Mapping[str, Any]], count: str) -> Table:
+    """Return every figure of every set of pixels, a line each."""
+    cells = [
+        (*_names(row), pixels, figure, value)
+        for row in rows
+        for pixels, figures in row.get("figures", {}).items()
+        for figure, value in figures.items()
+        if value is not None
+    ]
+    heads = ("matcher", "setting", "pixels", "figure", "value")
+    return Table(f"figures by pixels; {count}", tuple(Column(head, None) for head in heads), tuple(cells))
+
+
+def _comparisons(entries: Sequence[Mapping[str, Any]], count: str) -> Table:
+    """Return the differences of every two rows, a line each."""
+    heads = list(entries[0])
+    cells = tuple(tuple(entry.get(head) for head in heads) for entry in entries)
+    return Table(f"differences, first minus second; {count}", tuple(Column(head, None) for head in heads), cells)
 
 
 def _pairs(rows: Sequence[Mapping[str, Any]], count: str) -> Table:

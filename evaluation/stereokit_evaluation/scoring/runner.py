@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import FileError, InputError, StereokitError, one_line
-from stereokit.io import DISPARITY_SUFFIXES, read_disparity
+from stereokit.io import read_disparity
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit_evaluation.data.frame import Frame
-from stereokit_evaluation.scoring.kitti import Score, score
+from stereokit_evaluation.scoring.assessment import Official, assess
+from stereokit_evaluation.scoring.kitti import Score
+from stereokit_evaluation.scoring.measures import Measures
+from stereokit_evaluation.scoring.outside import OutsideMethod, Program, map_of
 
 __all__ = [
     "Estimate",
@@ -33,10 +36,8 @@ __all__ = [
     "score_frames",
     "seen_in_training",
     "with_matcher",
+    "with_outside",
 ]
-
-
-_MAPS = (*DISPARITY_SUFFIXES, ".tif")
 
 
 class _Disparity(Protocol):
@@ -65,12 +66,30 @@ Observer = Callable[[Frame, Estimate, NDArray[np.float32] | None, NDArray[np.flo
 
 @dataclass(frozen=True)
 class Scored:
-    """One frame's counts, the seconds of its matching, if any was run, and warnings about it."""
+    """One frame's scores, the seconds of its matching, if any was run, and warnings about it.
+
+    Attributes
+    ----------
+    name : str
+    score : Score
+        As the KITTI 2015 development kit counts.
+    seconds : float or None
+    warnings : tuple of str
+    measures : Measures
+        Further figures, by set of pixels.
+    official : mapping or None
+        By the rules of the frame's benchmark.
+    scene : str or None
+        The scene that the frame is of; None is one of its own.
+    """
 
     name: str
     score: Score
     seconds: float | None = None
     warnings: tuple[str, ...] = ()
+    measures: Measures = field(default_factory=Measures)
+    official: Official | None = None
+    scene: str | None = None
 
 
 @dataclass(frozen=True)
@@ -96,9 +115,11 @@ class Result:
     frames: tuple[Scored, ...] = ()
     skipped: tuple[Skipped, ...] = ()
     score: Score = field(init=False)
+    measures: Measures = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "score", sum((frame.score for frame in self.frames), Score()))
+        object.__setattr__(self, "measures", sum((frame.measures for frame in self.frames), Measures()))
 
     @property
     def seconds_per_image(self) -> float | None:
@@ -169,13 +190,16 @@ def score_frames(
                 if noc is None and occ is None:
                     raise FileError("the frame has no ground truth")
                 result = estimate(frame)
-                scores = score(result.disparity, noc=noc, occ=occ, objects=objects, measured=result.measured)
+                truth = {"noc": noc, "occ": occ, "objects": objects}
+                scores = assess(frame, truth, result.disparity, result.measured)
         except (StereokitError, OSError) as error:
             yield Skipped(frame.name, one_line(str(error)))
             continue
         if observe is not None:
             observe(frame, result, noc, occ)
-        yield Scored(frame.name, scores, result.seconds, tuple(warnings))
+        yield Scored(
+            frame.name, scores.score, result.seconds, tuple(warnings), scores.measures, scores.official, frame.scene
+        )
 
 
 def seen_in_training(matcher: object, dataset: str, frames: Iterable[Frame]) -> str | None:
@@ -221,10 +245,9 @@ def with_matcher(matcher: Matching, *, gray: bool = True) -> Estimator:
 
 
 def from_files(directory: str | Path) -> Estimator:
-    """Return an estimator that reads ``NAME.png`` (16-bit KITTI, 0 unknown), ``.pfm``, ``.npy``, ``.tiff`` or ``.tif``.
+    """Return an estimator that reads finished maps (`stereokit_evaluation.scoring.outside.map_of`).
 
-    For a name with folders, such as ``2003/cones``, the last part alone will do. All unknown pixels count as
-    not measured, and are filled before scoring.
+    All unknown pixels count as not measured, and are filled before scoring.
 
     Raises
     ------
@@ -234,12 +257,35 @@ def from_files(directory: str | Path) -> Estimator:
     base = Path(directory)
     if not base.is_dir():
         raise FileError(f"predictions must be a folder, got {str(base)!r}, which is not")
+    return lambda frame: Estimate(read_disparity(map_of(base, frame.name)))
+
+
+def with_outside(method: OutsideMethod) -> Estimator:
+    """Return an estimator that gives a method of others the images as they are stored, and times it.
+
+    A function is called once more on the first pair, to warm up; a program is not.
+    """
+    warm = False
 
     def estimate(frame: Frame) -> Estimate:
-        for name in (frame.name, frame.name.rpartition("/")[2]):
-            for ending in _MAPS:
-                if (path := base / f"{name}{ending}").exists():
-                    return Estimate(read_disparity(path))
-        raise FileError(f"no map {frame.name}{', '.join(_MAPS)} in {str(base)!r}")
+        nonlocal warm
+        left, right = frame.load_pair()
+        if left.shape != right.shape:
+            raise InputError(f"left and right must have one size, got {left.shape} and {right.shape}")
+        try:
+            if isinstance(method, Program):
+                result, seconds = method.timed(frame, left, right)
+            else:
+                if not warm:
+                    method(frame, left, right)
+                    warm = True
+                start = time.perf_counter()
+                result = method(frame, left, right)
+                seconds = time.perf_counter() - start
+        except (StereokitError, OSError):
+            raise
+        except Exception as error:  # a slip in another's method costs the frame
+            raise InputError(one_line(f"{method.name}: {type(error).__name__}: {error}")) from error
+        return Estimate(result.disparity, result.valid, seconds)
 
     return estimate

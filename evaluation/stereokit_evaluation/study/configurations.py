@@ -13,7 +13,7 @@ import hashlib
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from stereokit.methods import find_refiner, option_names, parse_method
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit_evaluation.bench import baselines
 from stereokit_evaluation.common.weights import needs_weights
+from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.scoring.outside import MapFolder, OutsideMethod
 from stereokit_evaluation.scoring.runner import Matching
 
 __all__ = [
@@ -35,9 +37,12 @@ __all__ = [
     "Configuration",
     "available_variants",
     "baseline",
+    "baseline_key",
     "build",
     "describe_error",
     "fingerprint",
+    "merged",
+    "outside",
     "parse_variant",
     "title",
 ]
@@ -45,7 +50,7 @@ __all__ = [
 PAPER_VARIANTS = {"linear": "Mini+Linear", "original": "Original", "cnn": "Mini+CNN", "stereovae": "Mini+StereoVAE"}
 """The paper's variants, by the names that ``--variant`` takes."""
 BASELINE = "peer"
-"""The variant of another library's matcher."""
+"""The variant of a method that is not ours: another library's matcher, a function, a program, finished maps."""
 
 _NO_VARIANTS = ("auto", "file", "general")  # choose among others, take a path, are another's second name
 
@@ -66,11 +71,15 @@ class Configuration:
     variant : str
         A key of `PAPER_VARIANTS`, another refiner's name, or `BASELINE`.
     matcher : callable or None
-        The function of two images; None if it cannot be built.
+        The function of two images; None if it cannot be built, and for a method of others.
     identity : dict
         Everything its maps depend on, except the images: resolved options, weights, source.
     missing : str or None
         Why it cannot be built, in one line.
+    outside : OutsideMethod or None
+        A method of others, which is given the frame and its images as they are stored.
+    by_frame : mapping, optional
+        Where one row has frames of several data sets: each frame's own configuration and frame, by the name in the row.
     """
 
     method: str
@@ -79,6 +88,45 @@ class Configuration:
     matcher: Matching | None = None
     identity: dict[str, Any] = field(default_factory=dict)
     missing: str | None = None
+    outside: OutsideMethod | None = None
+    by_frame: Mapping[str, tuple[Configuration, Frame]] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """``"stereokit"``, ``"opencv"`` (another library), ``"function"``, ``"program"`` or ``"maps"``."""
+        if self.outside is not None:
+            return self.outside.kind
+        return "opencv" if self.variant == BASELINE else "stereokit"
+
+    @property
+    def can_match(self) -> bool:
+        """Whether it can be built, and has maps of any images: finished ones have none of others."""
+        return self.matcher is not None or self.outside is not None
+
+    def identity_on(self, frame: Frame) -> dict[str, Any]:
+        """Return `identity` with what else a map of this frame depends on: the file of a finished one.
+
+        Raises
+        ------
+        FileError
+            If there is no such file.
+        """
+        if isinstance(self.outside, MapFolder):
+            return {**self.identity, "file": self.outside.digest_of(frame)}
+        return self.identity
+
+    def match_frame(self, frame: Frame, *, gray: bool = True) -> Any:
+        """Return the result of matching a frame, whose images are loaded as the method wants them."""
+        chosen, own = self.by_frame.get(frame.name, (self, frame))
+        left, right = own.load_pair(gray=gray and chosen.outside is None)
+        return chosen.match(own, left, right)
+
+    def match(self, frame: Frame, left: Any, right: Any) -> Any:
+        """Return the result for two images of a frame: grey ones, or for a method of others as they are stored."""
+        if self.outside is not None:
+            return self.outside(frame, left, right)
+        assert self.matcher is not None
+        return self.matcher(left, right)
 
     @property
     def name(self) -> str:
@@ -173,6 +221,26 @@ def baseline(key: str, levels: int) -> Configuration:
     source = fingerprint(Path(baselines.__file__))
     identity = {"peer": key, "levels": levels, "opencv": cv2.__version__, "source": source}
     return Configuration(key, key, BASELINE, baselines.padded(key, levels), identity)
+
+
+def baseline_key(text: str) -> str | None:
+    """Return the name of OpenCV's mode that `text` names, such as ``"OpenCV HH"`` or ``"opencv-hh"``, None for none."""
+
+    def plain(name: str) -> str:
+        return re.sub(r"[^a-z0-9]", "", name.lower())
+
+    keys = (key for key in baselines.BASELINES if key.startswith("OpenCV"))
+    return next((key for key in keys if plain(key) == plain(text)), None)
+
+
+def outside(method: OutsideMethod) -> Configuration:
+    """Return a method of others as a configuration."""
+    return Configuration(method.name, method.name, BASELINE, identity=method.identity(), outside=method)
+
+
+def merged(configuration: Configuration, by_frame: Mapping[str, tuple[Configuration, Frame]]) -> Configuration:
+    """Return one configuration for frames of several data sets (`Configuration.by_frame`)."""
+    return replace(configuration, by_frame=dict(by_frame))
 
 
 @cache

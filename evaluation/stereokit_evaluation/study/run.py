@@ -4,7 +4,8 @@ Frames are the outer loop: a pair is loaded once and all configurations take tur
 all alike, and an interrupt leaves the same frames for all. Each configuration is called once to warm up; on each
 frame it is then called `repeats` times, and the median counts.
 
-A frame that fails in one configuration is left out for all, so that the rows stay comparable.
+A frame that fails in one configuration is left out for all, so that the rows stay comparable. A program of others is
+run once for each frame, and finished maps are only read.
 """
 
 from __future__ import annotations
@@ -25,13 +26,17 @@ from stereokit.kernels.trace import observed
 from stereokit.notices import collecting
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL, StageTimer
 from stereokit_evaluation.data import datasets
+from stereokit_evaluation.data import disturbed as disturbed_frames
 from stereokit_evaluation.data import frame as frames
 from stereokit_evaluation.data.frame import Frame
-from stereokit_evaluation.scoring import kitti
-from stereokit_evaluation.scoring.kitti import score
+from stereokit_evaluation.scoring import assessment, eth3d, kitti, measures, middlebury
+from stereokit_evaluation.scoring.assessment import assess
+from stereokit_evaluation.scoring.outside import Program
 from stereokit_evaluation.scoring.runner import Result, Scored, Skipped
 from stereokit_evaluation.study.configurations import BASELINE, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
+from stereokit_evaluation.synthetic import disturbances as faults
+from stereokit_evaluation.synthetic import sensors
 
 __all__ = ["Study", "StudyRow", "measure", "run_study"]
 
@@ -53,12 +58,15 @@ class StudyRow:
         Milliseconds a frame, in all and by group of stages: medians over the frames of `result`.
     missing : str or None
         The reason why there are no results.
+    failed : int
+        The number of frames that it failed on.
     """
 
     configuration: Configuration
     result: Result
     ms: dict[str, float]
     missing: str | None = None
+    failed: int = 0
 
 
 @dataclass
@@ -99,6 +107,13 @@ class _LoadedFrame:
         return left, right
 
     @cached_property
+    def stored_images(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        left, right = self.frame.load_pair()
+        if left.shape != right.shape:
+            raise InputError(f"left and right must have one size, got {left.shape} and {right.shape}")
+        return left, right
+
+    @cached_property
     def truth(self) -> dict[str, NDArray[Any] | None]:
         maps = {name: getattr(self.frame, f"load_{name}")() for name in ("noc", "occ", "objects")}
         size = self.images[0].shape[:2]
@@ -122,6 +137,7 @@ def run_study(
     repeats: int = 3,
     gray: bool = True,
     about_times: Any = None,
+    warm_up: bool = True,
     step: Callable[[str, int], None] = lambda text, advance: None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Study:
@@ -139,6 +155,8 @@ def run_study(
         Give grey images.
     about_times : any
         Further conditions of the times: threads, processor.
+    warm_up : bool
+        Call each configuration once before it is timed. Without, the first time is too long, and nothing is repeated.
     step : callable
         Called with a short text and a number of steps, before each configuration of each frame.
     report : callable
@@ -155,10 +173,11 @@ def run_study(
         If the store cannot be written to.
     """
     study = Study()
-    missing = {index: c.missing or "" for index, c in enumerate(configurations) if c.matcher is None}
+    missing = {index: c.missing or "" for index, c in enumerate(configurations) if not c.can_match}
     records: dict[int, dict[str, Record]] = {index: {} for index in range(len(configurations)) if index not in missing}
     failures: dict[str, list[tuple[int | None, str]]] = {}
-    warm: set[int] = set()
+    scenes: dict[str, str | None] = {}
+    warm: set[int] = set() if warm_up else set(range(len(configurations)))
 
     def fail(frame: Frame, index: int | None, reason: str) -> None:
         report(f"skipped {frame.name}: {_named(configurations, index, reason)}")
@@ -170,6 +189,7 @@ def run_study(
     try:
         for frame in all_frames:
             loaded, warnings = _LoadedFrame(frame, gray), list[str]()
+            scenes[frame.name] = frame.scene
             step(frame.name, sum(index in missing for index in range(len(configurations))))
             for index, configuration in enumerate(configurations):
                 if index in missing:
@@ -177,7 +197,13 @@ def run_study(
                 step(f"{frame.name}: {configuration.name}", 1)
                 path = f"{configuration.label}/{title(configuration.variant)}/{frame.name}"
                 try:
-                    key = digest([loaded.digest, configuration.identity, *common])
+                    content = loaded.digest
+                    try:
+                        identity = configuration.identity_on(frame)
+                    except (StereokitError, OSError) as error:
+                        fail(frame, index, describe_error(error))
+                        continue
+                    key = digest([content, identity, *common])
                     record = store.get(path, key)
                     if record is None:
                         _ = loaded.images, loaded.truth  # here, because trouble with these is the frame's
@@ -196,7 +222,7 @@ def run_study(
                         fail(frame, index, describe_error(error))
                         continue
                     warm.add(index)
-                    store.put(path, key, record, {"frame": frame.name, "identity": configuration.identity})
+                    store.put(path, key, record, {"frame": frame.name, "identity": identity})
                     study.computed += 1
                 else:
                     study.reused += 1
@@ -205,7 +231,7 @@ def run_study(
                 report(f"warning: {frame.name}: {line}")
     except KeyboardInterrupt:
         study.interrupted = True
-    _pool(study, configurations, records, missing, failures)
+    _pool(study, configurations, records, missing, failures, scenes)
     return study
 
 
@@ -227,28 +253,34 @@ def measure(
     clock : callable
         Returns seconds.
     """
-    matcher = configuration.matcher
-    assert matcher is not None
-    left, right = loaded.images
+    outside, frame = configuration.outside, loaded.frame
+    left, right = loaded.images if outside is None else loaded.stored_images
     truth = loaded.truth
-    if not warm:
-        matcher(left, right)
     runs: list[dict[str, float]] = []
-    for _ in range(repeats):
-        timer = StageTimer(clock, groups=True)
-        if configuration.variant == BASELINE:
-            start = clock()
-            result = matcher(left, right)
-            runs.append({TOTAL: clock() - start})
-            continue
-        with observed(timer):
-            start = clock()
-            result = matcher(left, right)
-            total = clock() - start
-        group_seconds = {group: timer.seconds.get(group, 0.0) for group in GROUPS}
-        runs.append({TOTAL: total, **group_seconds, OTHER: total - sum(group_seconds.values())})
-    counts = score(np.asarray(result.disparity), **truth, measured=np.asarray(result.valid))
-    return Record(counts, {name: 1e3 * median(run[name] for run in runs) for name in runs[0]})
+    if isinstance(outside, Program):
+        result, seconds = outside.timed(frame, left, right)
+        runs.append({TOTAL: seconds})
+    elif configuration.kind == "maps":
+        result = configuration.match(frame, left, right)
+    else:
+        if not warm:
+            configuration.match(frame, left, right)
+        for _ in range(repeats):
+            timer = StageTimer(clock, groups=True)
+            if configuration.variant == BASELINE:
+                start = clock()
+                result = configuration.match(frame, left, right)
+                runs.append({TOTAL: clock() - start})
+                continue
+            with observed(timer):
+                start = clock()
+                result = configuration.match(frame, left, right)
+                total = clock() - start
+            group_seconds = {group: timer.seconds.get(group, 0.0) for group in GROUPS}
+            runs.append({TOTAL: total, **group_seconds, OTHER: total - sum(group_seconds.values())})
+    scores = assess(frame, truth, np.asarray(result.disparity), np.asarray(result.valid))
+    ms = {name: 1e3 * median(run[name] for run in runs) for name in runs[0]} if runs else {}
+    return Record(scores.score, ms, scores.measures, scores.official)
 
 
 def _named(configurations: Sequence[Configuration], index: int | None, reason: str) -> str:
@@ -261,8 +293,8 @@ def _times_failed(failures: dict[str, list[tuple[int | None, str]]], index: int)
 
 def _source() -> list[str]:
     """Return the digests of the modules that scores and times depend on."""
-    modules = (datasets.__file__, frames.__file__, kitti.__file__, __file__)
-    return [fingerprint(Path(str(file))) for file in modules]
+    modules = (datasets, frames, disturbed_frames, faults, sensors, kitti, measures, assessment, eth3d, middlebury)
+    return [fingerprint(Path(str(file))) for file in (*(module.__file__ for module in modules), __file__)]
 
 
 def _pool(
@@ -271,6 +303,7 @@ def _pool(
     all_records: dict[int, dict[str, Record]],
     missing: dict[int, str],
     failures: dict[str, list[tuple[int | None, str]]],
+    scenes: dict[str, str | None],
 ) -> None:
     """Build the rows over the frames that all configurations scored; one that scored none is missing."""
     scored_names = {name for records in all_records.values() for name in records}
@@ -285,11 +318,19 @@ def _pool(
         if reasons:
             study.skipped.append(Skipped(name, reasons[0]))
     for index, configuration in enumerate(configurations):
+        failed = _times_failed(failures, index)
         if index in missing:
-            study.rows.append(StudyRow(configuration, Result(), {}, missing[index]))
+            study.rows.append(StudyRow(configuration, Result(), {}, missing[index], failed))
             continue
         records = {name: all_records[index][name] for name in shared_names}
-        scored = tuple(Scored(name, r.score, r.ms[TOTAL] / 1e3) for name, r in records.items())
+        scored = tuple(_scored(name, record, scenes.get(name)) for name, record in records.items())
         names = list(next(iter(records.values())).ms) if records else []
         ms = {name: median(record.ms[name] for record in records.values()) for name in names}
-        study.rows.append(StudyRow(configuration, Result(scored), ms))
+        study.rows.append(StudyRow(configuration, Result(scored), ms, failed=failed))
+
+
+def _scored(name: str, record: Record, scene: str | None) -> Scored:
+    total = record.ms.get(TOTAL)
+    return Scored(
+        name, record.score, None if total is None else total / 1e3, (), record.measures, record.official, scene
+    )

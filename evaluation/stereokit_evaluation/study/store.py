@@ -12,7 +12,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,13 @@ from stereokit.errors import FileError
 from stereokit.io import parsing, read_bytes, write_bytes
 from stereokit_evaluation.common.folders import make_folder
 from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.scoring.assessment import Official
 from stereokit_evaluation.scoring.kitti import Counts, Regions, Score, Tally
+from stereokit_evaluation.scoring.measures import SETS, Errors, Measures
 
 __all__ = ["Record", "Store", "digest", "frame_digest"]
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,17 @@ class Record:
     score : Score
         The counts.
     ms : dict of str to float
-        Median milliseconds: ``"total"`` and, where known, by group of stages.
+        Median milliseconds: ``"total"`` and, where known, by group of stages; empty if nothing was timed.
+    measures : Measures
+        Further figures, by set of pixels.
+    official : mapping or None
+        By the rules of the frame's benchmark.
     """
 
     score: Score
     ms: dict[str, float]
+    measures: Measures = field(default_factory=Measures)
+    official: Official | None = None
 
 
 class Store:
@@ -74,7 +82,8 @@ class Store:
             file = self._file(path, key)
             with parsing(file, "record"):
                 content = json.loads(read_bytes(file))
-                return Record(_score(content["score"]), {str(k): float(v) for k, v in content["ms"].items()})
+                ms = {str(name): float(value) for name, value in content["ms"].items()}
+                return Record(_score(content["score"]), ms, _measures(content["measures"]), content["official"])
         except FileError:
             return None
 
@@ -90,7 +99,7 @@ class Store:
             return
         file = self._file(path, key)
         make_folder(file.parent)
-        content = {"score": asdict(record.score), "ms": record.ms, "key": key, "about": about}
+        content = {**asdict(record), "key": key, "about": about}
         write_bytes(file, json.dumps(content, default=str).encode())
 
     def _file(self, path: str, key: str) -> Path:
@@ -136,6 +145,16 @@ def _feed(hasher: Any, source: Any) -> None:
         hasher.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
     else:
         hasher.update(repr(source).encode())
+
+
+def _measures(content: Mapping[str, Any]) -> Measures:
+    def errors(part: Mapping[str, Any]) -> Errors:
+        pixels, measured, outliers, pairs = (int(part[name]) for name in ("pixels", "measured", "outliers", "pairs"))
+        quantiles, bad = (tuple(float(value) for value in part["quantile_sums"]), tuple(int(n) for n in part["bad"]))
+        sums = float(part["error_sum"]), float(part["square_sum"])
+        return Errors(pixels, measured, outliers, bad, *sums, pairs, quantiles)
+
+    return Measures(**{name: errors(content[name]) for name in SETS})
 
 
 def _score(content: Mapping[str, Any]) -> Score:

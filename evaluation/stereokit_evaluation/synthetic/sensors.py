@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["Sensor", "draw_sensors", "expose"]
+__all__ = ["Sensor", "blurred", "compressed", "draw_sensors", "expose", "sensor_noise"]
 
 Rng = np.random.Generator
 
@@ -132,6 +132,20 @@ def blurred(image: NDArray[np.float64], deviation: float) -> NDArray[np.float64]
     return image if deviation < 0.15 else np.asarray(_blurred(image, _weights(deviation)))
 
 
+def sensor_noise(image: NDArray[np.float64], shot: float, read: float, rng: Rng) -> NDArray[np.float64]:
+    """Return light (H, W), range 0..1, with noise of variance ``shot * light + read**2``."""
+    return np.asarray(image + np.sqrt(shot * np.maximum(image, 0) + read**2) * rng.standard_normal(image.shape))
+
+
+def compressed(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """Return a picture (H, W) or (H, W, 3) after JPEG compression."""
+    stored = picture if picture.ndim == 2 else np.ascontiguousarray(picture[..., ::-1])
+    _, coded = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if picture.ndim == 2:
+        return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)[..., ::-1]
+
+
 def _defocused(fine: NDArray[np.float64], spread: NDArray[np.float64], base: float) -> NDArray[np.float64]:
     """Return the image blurred by `base` and `spread` (of each sample) together, from four blurs mixed."""
     steps = base + np.array([0.0, 1.0, 2.5, 5.0])
@@ -173,13 +187,10 @@ def expose(light: NDArray[np.float32], disparity: NDArray[np.float64], sensor: S
     height, width = image.shape
     y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)[None]
     image = np.minimum(image * (1 - sensor.vignette * (x * x + y * y) / 2), 1.0)
-    image = image + np.sqrt(sensor.shot * np.maximum(image, 0) + sensor.read**2) * rng.standard_normal(image.shape)
+    image = sensor_noise(image, sensor.shot, sensor.read, rng)
     image = blurred(image, sensor.resample)
     # a table keeps the power, which processors round differently, away from each pixel
     steps = np.rint(255 * 16 * np.clip(image, 0, 1)).astype(np.int64)
     code = 255 * (np.arange(255 * 16 + 1) / (255 * 16)) ** sensor.gamma * sensor.contrast + sensor.black
     picture = np.clip(np.rint(code[steps]), 0, 255).astype(np.uint8)
-    if sensor.quality:
-        _, coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, sensor.quality])
-        picture = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
-    return picture
+    return compressed(picture, sensor.quality) if sensor.quality else picture

@@ -36,6 +36,7 @@ document.addEventListener("DOMContentLoaded", async () => {
   document.getElementById("plotly").remove();
 
   const region = document.getElementById("region");
+  const fault = document.getElementById("fault-figure"); // what the lines of disturbances show
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const measure = document.createElement("canvas").getContext("2d");
 
@@ -84,10 +85,13 @@ document.addEventListener("DOMContentLoaded", async () => {
       if (figure.height) element.style.height = `${figure.height}px`;
       const narrow = element.clientWidth < 480;
       const [key, variants] = Object.entries(figure.variants ?? {})[0] ?? [];
-      const data = figure.data.map((trace, k) => (key ? { ...trace, [key]: variants[region.value][k] } : { ...trace }));
+      const choice = key && (region.value in variants ? region : fault);
+      const data = figure.data.map((trace, k) => (key ? { ...trace, [key]: variants[choice.value][k] } : { ...trace }));
       const texts = data.map((trace) => trace.mode?.includes("text") ? trace : { ...trace, text: null });
       const bare = data.map((trace) => trace.mode ? { ...trace, mode: trace.mode.replace("+text", "") } : trace);
-      await Plotly.react(id, bare, layout(figure, narrow), config);
+      const drawn = layout(figure, narrow);
+      if (choice === fault && fault) drawn.yaxis.title = { text: fault.selectedOptions[0].textContent };
+      await Plotly.react(id, bare, drawn, config);
       if (texts.some((trace) => trace.text)) {
         const label = () => Plotly.relayout(element, { annotations: annotations(element, texts, narrow ? 10 : 12) });
         await label();
@@ -103,6 +107,7 @@ document.addEventListener("DOMContentLoaded", async () => {
     waiting = setTimeout(draw, 200);
   });
   region?.addEventListener("change", draw);
+  fault?.addEventListener("change", draw);
   Page.onTheme(draw);
   await draw();
 });

@@ -19,6 +19,7 @@ from stereokit_evaluation.commands.study import study
 from stereokit_evaluation.commands.view import view
 from stereokit_evaluation.data import datasets
 from stereokit_evaluation.report import charts, page, viewer
+from stereokit_evaluation.report.measures import by_data_set, measure_rows
 from stereokit_evaluation.report.packing import unpack_map, unpack_mask
 from stereokit_evaluation.report.page import chosen_frames, render
 from stereokit_evaluation.report.per_pair import per_pair
@@ -99,7 +100,7 @@ def test_published_bars_stand_beside_ours(study_page):
     assert there["y"][-2:] == ["OpenCV 3WAY", "OpenCV HH"] and there["x"][-2:] == [None, None]
     points = blocks(page)["charts"]["chart-time"]["data"]
     assert "published" in points[-1]["name"] and "StereoVAE" in points[-1]["text"]
-    assert any(trace["name"] == "other libraries, this machine" for trace in points)
+    assert any(trace["name"] == "other methods, this machine" for trace in points)
     shapes = [trace["marker"]["symbol"] for trace in points]
     assert len(set(shapes)) == len(shapes)  # settings differ by more than colour
 
@@ -155,6 +156,30 @@ def test_a_study_of_many_maps_takes_the_folder(tmp_path, monkeypatch):
     assert "pair-0" not in blocks(text) and 'data-tile="report_files/pair-0.js"' in text
     assert len(list((tmp_path / "report_files").iterdir())) == 2 * (1 + 2)
     assert blocks(text)["per-pair"]["viewer"].keys() == {"scene_000", "scene_001"}
+
+
+def measured(name, d1, interval=None):
+    figures = {part: {"d1": d1, "bad-1": d1 and 2 * d1} for part in ("main", "occluded", "edges")}
+    return {"name": name, "missing": None, "figures": figures, "intervals": {"d1": interval}}
+
+
+def test_all_measures_beside_the_best():
+    rows = [measured("a", 3.0, [2.0, 4.0]), measured("b", 1.5), measured("c", None), {"missing": "x", "figures": {}}]
+    comparison = {"first": "a", "second": "b", "figure": "d1", "difference": 1.5, "low": 0.5, "high": 2.0, "p": 0.03}
+    other = {**comparison, "figure": "epe", "difference": 9.0}
+    first, best = measure_rows({"results": rows, "comparisons": [other, comparison]})
+    assert first["interval"] == [2.0, 4.0] and first["figures"]["bad-1"] == 6.0 and first["figures"]["a90"] is None
+    assert first["beside"] == {"difference": 1.5, "low": 0.5, "high": 2.0, "p": 0.03}
+    assert best["best"] and best["beside"] is None and best["interval"] is None
+    turned = {"first": "b", "second": "a", "figure": "d1", "difference": -1.5, "low": -2.0, "high": -0.5, "p": 0.03}
+    assert measure_rows({"results": rows, "comparisons": [turned]})[0]["beside"] == first["beside"]
+    assert measure_rows({"results": [{"missing": None}]}) == []  # a study of before these figures
+
+
+def test_figures_by_data_set():
+    parts = {"kitti": {"results": [measured("a", 3.0), measured("b", 1.0)]}, "eth": {"results": [measured("b", 2.0)]}}
+    assert by_data_set({"data": parts}) == (["kitti", "eth"], [("a", [3.0, None]), ("b", [1.0, 2.0])])
+    assert by_data_set({"data": {"kitti": parts["kitti"]}}) == by_data_set({}) == ([], [])
 
 
 def test_the_figures_pair_by_pair():

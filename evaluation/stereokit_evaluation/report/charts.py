@@ -35,7 +35,6 @@ _SYMBOLS = {"linear": "triangle-up", "original": "circle", "cnn": "pentagon", "s
 _OTHER_SYMBOLS = ("triangle-down", "hexagon", "cross", "x", "hourglass", "bowtie")
 _TICKS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000]
 _BASELINE_COLOUR = "#8a8a8a"
-_FEW_LINES = 8  # whose names fit beside them
 _ROW_PX, _FRAME_PX = 30, 110  # height of a row of bars, and of axis and legend
 
 JsonRow = Mapping[str, Any]
@@ -50,19 +49,13 @@ def figures(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         "chart-time": accuracy_time(rows),
     }
     faults = disturbance_charts(document.get("disturbances") or {})
-    return charts | {f"chart-fault-{kind}": _named_lines(kind, chart) for kind, chart in faults.items()}
+    return charts | {f"chart-fault-{kind}": _titled(kind, chart) for kind, chart in faults.items()}
 
 
-def _named_lines(kind: str, chart: dict[str, Any]) -> dict[str, Any]:
-    """Return a chart of lines with a title, its legend on top, and names at the lines' ends if they are few."""
+def _titled(kind: str, chart: dict[str, Any]) -> dict[str, Any]:
+    """Return a chart of lines with a title, and its legend on top, clear of the axis."""
     layout = {**chart["layout"], "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom"}}
-    traces = chart["data"]
-    if len(traces) <= _FEW_LINES:
-        traces = [
-            {**trace, "mode": f"{trace['mode']}+text", "text": [None] * (len(trace["x"]) - 1) + [trace["name"]]}
-            for trace in traces
-        ]
-    return {**chart, "data": traces, "layout": layout, "title": f"Error against {kind}"}
+    return {**chart, "layout": layout, "title": f"Error against {kind}"}
 
 
 def row_name(row: JsonRow) -> str:
@@ -146,7 +139,7 @@ def accuracy_time(rows: Sequence[JsonRow]) -> dict[str, Any]:
         (title(s), [r for r in rows if r["setting"] != BASELINE and _variant(r) == s], colour(s, variants), s)
         for s in variants
     ]
-    groups.append(("other libraries", [row for row in rows if row["setting"] == BASELINE], _BASELINE_COLOUR, ""))
+    groups.append(("other methods", [row for row in rows if row["setting"] == BASELINE], _BASELINE_COLOUR, ""))
     for name, members, color, variant in groups:
         scored = [row for row in members if row["missing"] is None and row["ms"]]
         if not scored:

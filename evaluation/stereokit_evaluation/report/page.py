@@ -30,6 +30,7 @@ from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.report import charts as _charts
 from stereokit_evaluation.report import viewer
 from stereokit_evaluation.report.disturbance_charts import FIGURE_TITLES
+from stereokit_evaluation.report.measures import COLUMNS, by_data_set, measure_rows
 from stereokit_evaluation.report.per_pair import per_pair
 from stereokit_evaluation.report.tiles import TileFolder, json_text
 from stereokit_evaluation.scoring.runner import Scored
@@ -82,6 +83,9 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
         title=f"Robustness study: {title}",
         document=document,
         rows=rows,
+        measures=measure_rows(document),
+        measure_columns=COLUMNS,
+        data_sets=by_data_set(document),
         per_pair=per_pair(rows, [frame.name for frame in chosen], digits=3),
         methods=_first_methods(study.rows),
         regions=_charts.REGIONS,

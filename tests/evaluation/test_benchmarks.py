@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from stereokit.errors import InputError
+from stereokit_evaluation.data import datasets
 from stereokit_evaluation.data.frame import Benchmark, Frame
 from stereokit_evaluation.scoring import eth3d, middlebury
 from stereokit_evaluation.scoring.assessment import assess, average_official
 
 NAN, INF = np.nan, np.inf
+DATA = Path(os.environ.get("STEREOKIT_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 
 
 def middlebury_by_loop(disp, gt, mask, threshold, maxdisp, rounddisp, size):
@@ -205,3 +209,20 @@ def test_averages_follow_the_benchmark():
     assert average_official("middlebury", figures)["dense"]["nonocc"]["bad-2"] == (0.5 * 8 + 2) / 1.5
     assert average_official("eth3d", figures)["dense"]["nonocc"]["bad-2"] == 5
     assert average_official("eth3d", {"x": None}) is None
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "folder"), [("eth3d", "eth3d"), ("middlebury", "middlebury/2014")])
+def test_real_masks_say_what_counts(name, folder):
+    if not (DATA / folder).is_dir():
+        pytest.skip(f"no {folder} in {DATA}; set STEREOKIT_DATA")
+    for frame in datasets.load_frames(name, DATA / folder):
+        mask = cv2.imread(str(frame.left.with_name("mask0nocc.png")), cv2.IMREAD_GRAYSCALE)
+        assert set(np.unique(mask)) <= {0, 128, 255}
+        truth = {"noc": frame.load_noc(), "occ": frame.load_occ(), "objects": None}
+        figures = assess(frame, truth, truth["occ"] + np.float32(0.75)).official["dense"]
+        assert figures["nonocc"]["pixels"] == (np.isfinite(truth["occ"]) & (mask == 255)).sum()
+        assert figures["all"]["pixels"] == np.isfinite(truth["occ"]).sum() > figures["nonocc"]["pixels"]
+        # 0.75 px is an error of 0.75 px in ETH3D, and of 3 px at the full size of these quarter-size pairs
+        assert figures["nonocc"]["avgerr"] == pytest.approx(0.75 if name == "eth3d" else 3.0, abs=1e-3)
+        assert figures["all"]["bad-1"] == (0 if name == "eth3d" else 100)

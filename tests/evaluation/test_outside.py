@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import textwrap
 import time
@@ -143,6 +144,22 @@ def test_a_program_that_is_too_slow_ends_with_its_children(frame, script, tmp_pa
     before = signs.read_text() if signs.exists() else ""
     time.sleep(0.3)
     assert (signs.read_text() if signs.exists() else "") == before
+
+
+def test_an_interrupt_ends_the_program(frame, script, monkeypatch):
+    ended = []
+    real = subprocess.Popen.wait
+
+    def wait(process, timeout=None):
+        if not ended:
+            ended.append(process)
+            raise KeyboardInterrupt
+        return real(process, timeout)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", wait)
+    with pytest.raises(KeyboardInterrupt):
+        program(script("time.sleep(99)"), 64)(frame, image(3), image(7))
+    assert ended[0].returncode is not None and ended[0].returncode < 0
 
 
 def test_the_identity_follows_the_script(script):

@@ -37,7 +37,7 @@ FULL_WIDTHS = {
     "PianoL": 2820, "Pipes": 2940, "Playroom": 2800, "Playtable": 2720, "PlaytableP": 2720, "Recycle": 2880,
     "Shelves": 2952, "Teddy": 1800, "Vintage": 2912,
 }  # fmt: skip
-"""The 15 training pairs, with the width of their full size, pixels, to within a few."""
+"""The 15 training pairs, with about the width of their full size, pixels: `relative_size` picks the nearest size."""
 WEIGHTS = {
     name: 0.5 if name in ("PianoL", "Playroom", "Playtable", "Shelves", "Vintage") else 1.0 for name in FULL_WIDTHS
 }

@@ -63,6 +63,7 @@ def study_file(tmp_path_factory):
         datasets._scene.cache_clear()
         words = ["--count", "3", "--max-disparity", "64", "--threads", "1", "--repeats", "1", "--no-peers"]
         words += ["--variant", "linear", "--variant", "original", "-o", str(out)]
+        words += ["--disturb", "noise:5,20", "--disturb-frames", "1"]
         done = CliRunner().invoke(app, words)
     datasets._scene.cache_clear()
     assert done.exit_code == 0, (done.output, done.exception)
@@ -149,7 +150,7 @@ def slide(page, value):
 
 def test_the_report_opens_with_its_charts(chromium, study_file):
     with opened(chromium, study_file) as page:
-        assert page.locator(".js-plotly-plot").count() == 3
+        assert page.locator(".js-plotly-plot").count() == 4
         assert page.locator("#chart-e4 .bars path").count() >= 20
         assert page.locator("#chart-time .points path").count() >= 12
         names = page.locator("#chart-e4 .legendtext").all_text_contents()
@@ -161,6 +162,22 @@ def test_the_report_opens_with_its_charts(chromium, study_file):
         there = page.evaluate("document.getElementById('chart-e4').data[0]")
         printed = dict(zip(there["y"], there["x"], strict=True))
         assert [printed[f"{method} Mini+Linear"] for method in ("S1", "S2", "S3", "S4")] == [17.6, 9.73, 10.95, 9.56]
+
+
+def test_the_lines_of_a_disturbance_show_the_chosen_figure(chromium, study_file):
+    with opened(chromium, study_file) as page:
+        document = json.loads((study_file.parent / "study.json").read_text())
+        rows = document["disturbances"]["noise"]["results"]
+        chart = "document.getElementById('chart-fault-noise')"
+        for count, (figure, title) in enumerate([("epe", "mean error, px"), ("d1", "D1 error, %")], start=2):
+            page.select_option("#fault-figure", figure)
+            page.wait_for_selector(f"body[data-charts='{count}']")
+            drawn = page.evaluate(f"{chart}.data.map(trace => trace.y)")
+            assert drawn == [[row["undisturbed"][figure], *row["figures"][figure]] for row in rows]
+            assert page.evaluate(f"{chart}.layout.yaxis.title.text") == title
+        page.select_option("#region", "occ all")  # which is not theirs
+        page.wait_for_selector("body[data-charts='4']")
+        assert page.evaluate(f"{chart}.data.map(trace => trace.y)") == drawn
 
 
 @pytest.mark.parametrize("size", list(SIZES))

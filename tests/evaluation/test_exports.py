@@ -163,6 +163,55 @@ def test_a_chart_of_lines_can_be_drawn_and_tabled():
     assert {"S2", "offset, px", "D1, %"} <= texts
 
 
+def test_figures_intervals_and_comparisons(document, tmp_path):
+    for entry in document["results"][:2]:
+        entry["figures"] = {part: {"d1": entry["epe"], "density": 80.0} for part in ("main", "occluded")}
+        entry["intervals"] = {"d1": [1.25, 6.5], "density": None}
+    comparison = {"first": "a", "second": "b", "figure": "d1", "difference": -0.125, "low": None, "p": 0.5, "scenes": 3}
+    document["comparisons"] = [comparison]
+    tables = study_tables(document)
+    lines = read_csv(tables["measures"].csv())
+    assert [lines[0][key] for key in ("d1", "d1 low", "d1 high", "density low")] == ["4.123456789", "1.25", "6.5", ""]
+    assert "low" not in tables["measures"].latex() and "80.00" in tables["measures"].markdown()
+    long = read_csv(tables["measures_by_pixels"].csv())
+    assert len(long) == 8 and long[2] == {
+        "matcher": "S2", "setting": "Mini+Linear", "pixels": "occluded", "figure": "d1", "value": "4.123456789"
+    }  # fmt: skip
+    assert read_csv(tables["comparisons"].csv()) == [{k: "" if v is None else str(v) for k, v in comparison.items()}]
+    names = {path.name for path in write_exports(document, tmp_path)}
+    assert "comparisons.csv" in names and "comparisons.tex" not in names and "measures.tex" in names
+
+
+def test_every_data_set_has_tables_of_its_own(document):
+    part = {"results": document["results"][:1], "frames": ["f_0"], "split": None}
+    document["data"] = {"kitti 15": part, "eth3d": part}
+    tables = study_tables(document)
+    assert len(tables["accuracy"].rows) == 4 and len(tables["kitti_15_accuracy"].rows) == 1
+    assert "1 frame of kitti 15" in tables["kitti_15_accuracy"].title and "eth3d_times" in tables
+    document["data"] = {"eth3d": part}
+    assert "eth3d_times" not in study_tables(document)
+
+
+def test_disturbances_have_charts_and_numbers(document, tmp_path):
+    figure = {"d1": 5.0, "bad-1": 6.0, "bad-2": 7.0, "epe": 0.5, "density": 80.0}
+    result = {
+        "name": "S2 Original", "label": "S2", "variant": "original", "undisturbed": figure,
+        "figures": {key: [value + 1, None] for key, value in figure.items()},
+    }  # fmt: skip
+    entry = {"unit": "px", "views": "right", "about": "lower", "neutral": 0, "strengths": [1, 2], "results": [result]}
+    document["disturbances"] = {"offset": entry}
+    files = {path.name: path for path in write_exports(document, tmp_path)}
+    lines = read_csv(files["fault_offset.csv"].read_text())
+    head = "offset (right view), px"
+    assert [(line["figure"], line[head], line["value"]) for line in lines][:2] == [
+        ("d1", "0", "5.0"),
+        ("d1", "1", "6.0"),
+    ]
+    assert len(lines) == 2 * len(figure)  # nothing where there is no figure
+    if "fault_offset.svg" in files:
+        assert b"offset (right view), px" in files["fault_offset.svg"].read_bytes()
+
+
 def test_the_files_of_a_study(document, tmp_path):
     names = {str(path.relative_to(tmp_path)) for path in write_exports(document, tmp_path)}
     assert {"tables/accuracy.tex", "tables/times.md", "tables/pairs.csv", "charts/d1_validation.csv"} <= names

@@ -116,7 +116,9 @@ class Table:
 def study_tables(document: Mapping[str, Any]) -> dict[str, Table]:
     """Return the tables of a study's JSON, by the names of their files."""
     rows, name = document["results"], document["dataset"]
-    count = f"{len(document['frames'])} frames of {name}{', ' + document['split'] if document['split'] else ''}"
+    frames = len(document["frames"])
+    part = f", {document['split']}" if document["split"] else ""
+    count = f"{frames} frame{'' if frames == 1 else 's'} of {name}{part}"
     names = (Column("matcher", None), Column("setting", None))
     regions = [(region, part) for region in ("noc", "occ") for part in ("all", "bg", "fg")]
     thresholds = list(rows[0]["bad"]["noc"]) if rows else []

@@ -458,7 +458,7 @@ def test_tiles_are_read_when_they_are_looked_at(chromium, tmp_path):
         assert read(page)[0][:2] == ["m3", "8.00 px"]
         for index in range(12):  # what was looked at is not kept for ever
             page.evaluate("i => Viewer.show(i, 'm0', 'm1')", index)
-        assert page.evaluate("Viewer.kept()") <= 8
+        assert page.evaluate("Viewer.kept()") <= 6
 
 
 def test_a_page_without_its_folder_says_so(chromium, tmp_path):

@@ -28,7 +28,7 @@ const Tiles = (() => {
 const Viewer = (() => {
   const get = (id) => document.getElementById(id);
   const read = (id) => JSON.parse(get(id).textContent);
-  const MOST = 8; // decoded maps that are kept
+  const MOST = 6; // decoded maps that are kept
   const kept = []; // they themselves, the oldest first
   const text = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)}${unit}` : "–");
 
@@ -51,10 +51,17 @@ const Viewer = (() => {
     const state = { pair: null, a: null, b: null, x: 0, y: 0, cx: 0, cy: 0, cloud: false, load: 0 };
     const cache = new Map();
 
+    // A canvas without pixels gives its memory back at once, and not when the garbage is collected.
+    const free = (...pictures) => pictures.forEach((picture) => picture && (picture.width = 0));
+
     function keep(entry) {
       if (kept.includes(entry)) kept.splice(kept.indexOf(entry), 1);
       kept.push(entry);
-      while (kept.length > MOST) delete kept.shift().decoded;
+      while (kept.length > MOST) {
+        const old = kept.shift();
+        free(old.decoded.disparity, old.decoded.error, old.decoded.differences?.picture);
+        delete old.decoded;
+      }
       return entry.decoded;
     }
 
@@ -84,7 +91,12 @@ const Viewer = (() => {
     }
 
     async function pairAt(index) {
-      if (cache.has(index)) return cache.get(index);
+      if (cache.has(index)) {
+        const pair = cache.get(index);
+        cache.delete(index); // and to the end, as the newest
+        cache.set(index, pair);
+        return pair;
+      }
       const tile = controls.frame.options[index].dataset.tile;
       const pair = tile ? await Tiles.load(tile) : read(`pair-${index}`);
       const size = pair.width * pair.height;
@@ -92,7 +104,17 @@ const Viewer = (() => {
       pair.seenValues = pair.seen && (await Maps.mask(pair.seen, size));
       pair.picture = await Maps.photograph(pair.left, pair.width, pair.height);
       pair.rightPicture = pair.right && (await Maps.photograph(pair.right, pair.width, pair.height));
-      if (cache.size > 2) cache.delete(cache.keys().next().value);
+      if (cache.size > 1) {
+        const [oldest, old] = cache.entries().next().value;
+        cache.delete(oldest);
+        for (const entry of old.maps) {
+          if (!entry.decoded) continue;
+          kept.splice(kept.indexOf(entry), 1);
+          free(entry.decoded.disparity, entry.decoded.error, entry.decoded.differences?.picture);
+          delete entry.decoded;
+        }
+        free(old.picture, old.rightPicture);
+      }
       cache.set(index, pair);
       return pair;
     }
@@ -181,7 +203,7 @@ const Viewer = (() => {
         const context = canvas.getContext("2d");
         context.imageSmoothingEnabled = false;
         const [first, second] = pictures[name];
-        if (!first) continue;
+        if (!first?.width || !second.width) continue; // not there, or already given back
         context.drawImage(second, x0, y0, w, h, 0, 0, pair.width, pair.height);
         if (cut > 0) context.drawImage(first, x0, y0, cut / zoom, h, 0, 0, cut, pair.height);
         const thin = Math.max(1, pair.width / canvas.clientWidth);

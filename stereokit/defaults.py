@@ -137,6 +137,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "median": 5,
         "nodata": None,
         "right": False,
+        "search": "auto",
         "smooth": 0.6,
         "smp": True,
         "speckle": 0.0002,

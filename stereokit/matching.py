@@ -73,8 +73,10 @@ class Matcher:
         image), ``median`` (0, 3 or 5), ``border_cost`` (cost of matches outside the right image as a share of the
         cost's range, or None for the nearest border pixel; its old name is ``outside``), ``nodata`` (value of pixels
         without evidence, which match nothing and are never ``valid``; None leaves it to NaN, alpha and the marks that
-        `stereokit.images.intensity` detects), ``confidence`` (bool) and ``right`` (bool, the right view's map too;
-        twice the time). Defaults are those of `stereokit.defaults`.
+        `stereokit.images.intensity` detects), ``confidence`` (bool), ``right`` (bool, the right view's map too;
+        twice the time) and ``search`` ("full" tries all disparities at each pixel, "coarse-to-fine" 64 around the
+        map of half the size, so that time and memory do not grow with the range; "auto" does so from 129 on, with
+        S2 on the CPU). Defaults are those of `stereokit.defaults`.
 
     Raises
     ------
@@ -383,7 +385,9 @@ def _pipeline(settings: MatchSettings, device: str) -> Pipeline:
 
     if settings.scale == 0.25:
         raise DeviceError("scale must be 1 or 0.5 with device 'cuda', got 0.25")
-    return CudaPipeline(settings)
+    if settings.search == "coarse-to-fine":
+        raise DeviceError("search must be 'full' or 'auto' with device 'cuda', got 'coarse-to-fine'")
+    return CudaPipeline(settings.replaced(search="full"))
 
 
 def _mirror(pair: GrayPair) -> GrayPair:

@@ -45,6 +45,7 @@ class StageOptions(TypedDict, total=False):
     nodata: float | None
     confidence: bool
     right: bool
+    search: Literal["auto", "full", "coarse-to-fine"]
     # learned refiners
     weights: str | None
     backend: str

@@ -12,17 +12,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import CostInput, takes_8_bits
+from stereokit.costs.rows import CostInput, Levels, takes_8_bits
 from stereokit.errors import OptionError
 from stereokit.images.evidence import blank_pixels, joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
-from stereokit.images.resize import reduced, smooth
+from stereokit.images.resize import half_size, reduced, smooth
+from stereokit.kernels.simd import LANES
 from stereokit.kernels.threads import team
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.chain import post_process
 from stereokit.result import Disparity
+from stereokit.search import halved_levels, restore_thin, search_starts
 from stereokit.selection.wta import selection_output
 from stereokit.settings import Detail, MatchSettings
 
@@ -165,10 +167,31 @@ class CpuPipeline:
     def _coarse(self, pair: GrayPair, workspace: Workspace, threads: int) -> Disparity:
         """Return the map at the size of the matching."""
         settings = self.settings
-        cost, aggregation, levels = settings.cost, settings.aggregation, settings.matched_levels
         if settings.scale != 1:
             with span("prepare", "half size"):
                 pair = reduced(pair, settings.step)
+        return self._map(pair, settings.matched_levels, settings.detail, workspace, threads)
+
+    def _starts(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> NDArray[np.int16] | None:
+        """Return the first level of each pixel's search; None where every pixel searches all levels."""
+        if not self.settings.coarse_to_fine or levels.count <= LANES:
+            return None
+        with span("prepare", "half size"):
+            half = half_size(pair)
+        coarse = self._map(half, halved_levels(levels), None, workspace.part("half"), threads)
+        with span("prepare", "search ranges"):
+            starts = workspace.array("match.starts", pair.left.shape, np.int16)
+            search_starts(coarse.disparity, levels, starts)
+        return starts
+
+    def _map(
+        self, pair: GrayPair, levels: Levels, detail: Detail | None, workspace: Workspace, threads: int
+    ) -> Disparity:
+        """Return the map of a pair at its own size; without a `detail`, filled and for the search of the next size."""
+        settings = self.settings
+        cost, aggregation = settings.cost, settings.aggregation
+        starts = self._starts(pair, levels, workspace, threads)
+        guide = pair.guide
         with span("prepare", "smooth"):
             pair = smooth(pair, settings.smooth, workspace, threads, eight_bits=takes_8_bits(cost))
         shape = pair.left.shape
@@ -183,23 +206,35 @@ class CpuPipeline:
                     settings.border_cost,
                     threads,
                     pair.ranges,
+                    starts,
                 ),
                 workspace,
                 max(2, threads),
             )
         disparity = workspace.array("match.disparity", shape, np.float32)
         total = workspace.array("match.cost", shape, aggregation.total_dtype)
-        confidence = np.empty(shape, np.float32) if settings.detail >= Detail.CONFIDENCE else None
-        candidates = np.empty((2, *shape), np.float32) if settings.detail >= Detail.CANDIDATES else None
+        confidence = np.empty(shape, np.float32) if (detail or 0) >= Detail.CONFIDENCE else None
+        candidates = np.empty((2, *shape), np.float32) if (detail or 0) >= Detail.CANDIDATES else None
+        searched = levels.count if starts is None else LANES
         out = selection_output(
-            disparity, total, confidence, levels.count, levels.minimum, settings.subpixel, settings.uniqueness,
-            candidates,
+            disparity, total, confidence, searched, levels.minimum, settings.subpixel, settings.uniqueness,
+            candidates, starts,
         )  # fmt: skip
+        keywords = {} if starts is None else {"starts": starts}
         with span("match", "sweep, around its kernels"):
-            aggregation.sweep(rows, levels, cost, pair.guide, workspace, threads, out)
+            aggregation.sweep(rows, levels, cost, guide, workspace, threads, out, **keywords)
+        selected = None
+        if detail is None:
+            selected = workspace.array("match.selected", shape, np.float32)
+            np.copyto(selected, disparity)
         with span("clean", "post-processing"):
             chain = settings.post_processing(disparity.size)
-            disparity, valid = post_process(disparity, total, pair.left_bad, chain, workspace, threads)
+            if detail is None:
+                chain = replace(chain, fill="nearest", empty_value=levels.minimum)
+            bad = pair.left_bad if detail is not None else None
+            disparity, valid = post_process(disparity, total, bad, chain, workspace, threads)
+            if selected is not None:
+                restore_thin(selected, disparity)
             if pair.left_blank is not None:
                 valid &= ~pair.left_blank
             if confidence is not None:

@@ -20,6 +20,7 @@ from stereokit.postprocess.chain import PostProcessing
 from stereokit.postprocess.fill import FILLS
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
+from stereokit.search import SEARCHED_IN_FULL, SEARCHES
 
 __all__ = ["Detail", "MatchSettings"]
 
@@ -30,6 +31,7 @@ _PIPELINE = (
     "median",
     "nodata",
     "right",
+    "search",
     "smooth",
     "smp",
     "speckle",
@@ -86,6 +88,10 @@ class MatchSettings:
         The result includes the confidence.
     right : bool
         The result includes the right view's map.
+    search : {"auto", "full", "coarse-to-fine"}
+        Which levels a pixel tries: all, or `LANES` around the map of half the size (`stereokit.search`). "auto" goes
+        from coarse to fine where there are more than `SEARCHED_IN_FULL` levels, the method can, and its costs are
+        cheap: then it is faster, and on all data sets at least as accurate.
 
     Raises
     ------
@@ -111,6 +117,7 @@ class MatchSettings:
     median: int
     confidence: bool
     right: bool
+    search: str
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
@@ -130,6 +137,10 @@ class MatchSettings:
             put(name, check_number(name, getattr(self, name), 0, high))
         for name in ("smp", "subpixel", "confidence", "right"):
             put(name, check_flag(name, getattr(self, name)))
+        if not isinstance(self.search, str) or self.search not in SEARCHES:
+            raise UnknownNameError(did_you_mean("search", self.search, SEARCHES))
+        if self.search == "coarse-to-fine" and not self._can_narrow:
+            raise OptionError(f"search must be 'full' or 'auto' with method {self.method!r}, got 'coarse-to-fine'")
 
     @classmethod
     def parse(
@@ -185,6 +196,18 @@ class MatchSettings:
         return Levels(low, high - low)
 
     @property
+    def _can_narrow(self) -> bool:
+        return bool(getattr(self.cost, "narrow", False) and getattr(self.aggregation, "narrow", False))
+
+    @property
+    def coarse_to_fine(self) -> bool:
+        """Whether a pixel tries only levels around the map of half the size."""
+        if self.search == "auto":
+            gains = not self.cost.costly_to_recompute  # both sweeps of a narrow search compute the costs
+            return self._can_narrow and gains and self.matched_levels.count > SEARCHED_IN_FULL
+        return self.search == "coarse-to-fine"
+
+    @property
     def step(self) -> int:
         """Full-size pixels along a pixel of the matched size."""
         return round(1 / self.scale)
@@ -232,6 +255,8 @@ class MatchSettings:
                 content["weights"] = _fingerprint(value)
             elif field.name == "refiner_name":
                 content["refiner"] = value
+            elif field.name == "search":
+                content["search"] = "coarse-to-fine" if self.coarse_to_fine else "full"
             else:
                 content[field.name] = value if isinstance(value, (int, float, str, type(None))) else repr(value)
         return content

@@ -125,6 +125,41 @@ def sgm(volume, p1, p2, directions, guide=None, edge=0, edge_factor=1.0):
     return total
 
 
+def narrow_sgm(volume, starts, searched, p1, p2, directions):
+    """Sum over `directions` of path costs where a pixel has only the `searched` levels from its start on.
+
+    Levels that a pixel does not have offer nothing, neither to the next pixel nor to their neighbours at the pixel
+    itself: of the three terms of Hirschmueller's eq. 13 that name a level, those remain that both pixels have. The sum
+    of a level that a pixel does not have is -1.
+    """
+    height, width, _ = volume.shape
+    total = np.full(volume.shape, -1, np.int64)
+    for y in range(height):
+        for x in range(width):
+            total[y, x, starts[y, x] : starts[y, x] + searched] = 0
+    for dy, dx in directions:
+        paths = {}
+        rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
+        columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
+        for y in rows:
+            for x in columns:
+                before = paths.get((y - dy, x - dx))
+                own = range(starts[y, x], starts[y, x] + searched)
+                here = {d: int(volume[y, x, d]) for d in own}
+                if before is not None:
+                    least = min(before.values())
+                    for d in own:
+                        terms = [least + p2]
+                        for level, penalty in ((d, 0), (d - 1, p1), (d + 1, p1)):
+                            if level in before and level in here:
+                                terms.append(before[level] + penalty)
+                        here[d] += min(terms) - least
+                paths[y, x] = here
+                for d in own:
+                    total[y, x, d] += here[d]
+    return total
+
+
 def domain_transform(plane, guide, sigma_s, sigma_r, passes, sigma_v=None):
     """Recursive filter of one slice, ``(H, W)``, float64 (Gastal and Oliveira 2011, eq. 14 and 21).
 

@@ -12,6 +12,7 @@ along the row, and selects. The two never meet in a row, so two threads give wha
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -19,6 +20,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.aggregation.paths.narrow import (
+    NarrowBuffers,
+    finish_narrow_part,
+    first_narrow_visit,
+    prepare_narrow_rows,
+    start_narrow,
+)
 from stereokit.aggregation.paths.penalties import Penalties
 from stereokit.aggregation.paths.steps import PathBuffers
 from stereokit.aggregation.paths.visits import CHUNK, finish_part, first_visit, prepare_rows, start
@@ -70,6 +78,7 @@ class Sgm:
     name: ClassVar[str] = "sgm"
     total_dtype: ClassVar[Any] = np.uint16
     accepts_floats: ClassVar[bool] = False
+    narrow: ClassVar[bool] = True
     cuda: ClassVar[str] = "stereokit.aggregation.sgm_cuda"
 
     def __post_init__(self) -> None:
@@ -112,6 +121,7 @@ class Sgm:
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
         threads: int, out: SelectionOutput, total: NDArray[np.uint16] | None = None,
+        starts: NDArray[np.int16] | None = None,
     ) -> None:  # fmt: skip
         """Aggregate the rows of two producers and select.
 
@@ -133,7 +143,12 @@ class Sgm:
             Maps of the selection.
         total : (H, W, P) uint16 or None
             Volume for the sums over all paths, if they are wanted.
+        starts : (H, W) int16 or None
+            First level of each pixel's search, which takes `LANES` levels; None where all pixels try all levels.
         """
+        if starts is not None:
+            self._narrow_sweep(rows, starts, cost, guide, workspace, threads, out)
+            return
         height = guide.shape[0]
         key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.costly_to_recompute
         penalties, sums, workers = workspace.cached(
@@ -144,29 +159,47 @@ class Sgm:
             start(workers[0])
             _last_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out, total_out)
             return
-        middle = height // 2
 
         def first(k: int, y0: int, y1: int) -> None:
-            with span("match", "sweep: first visit"):
-                start(workers[k])
-                first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
+            start(workers[k])
+            first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
 
         def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
-            with span("match", "sweep: last visit"):
-                _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, total_out)
+            _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, total_out)
 
-        run_stages(
-            [
-                [partial(first, 0, 0, middle), partial(first, 1, height - 1, middle - 1)],
-                [partial(last, 0, middle, height, 1, middle), partial(last, 1, middle - 1, -1, -1, height - middle)],
-            ],
-            threads,
+        _meet(first, last, height, threads)
+
+    def _narrow_sweep(
+        self, rows: list[Any], starts: NDArray[np.int16], cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
+        threads: int, out: SelectionOutput,
+    ) -> None:  # fmt: skip
+        """Aggregate and select where each pixel has a search of its own."""
+        height = guide.shape[0]
+        key = self, guide.shape, cost.cost_max, cost.unit, "narrow"
+        penalties, sums, paths = workspace.cached(
+            "sgm", key, lambda: self._buffers(guide.shape, Levels(0, LANES), cost, workspace, LANES)
         )
+        edges = np.full(3 * LANES, 255, np.uint8)
+        edges[LANES : 2 * LANES] = 0
+        workers = [NarrowBuffers(buffers, starts.ravel(), edges) for buffers in paths]
+        if len(workers) == 1:
+            start_narrow(workers[0])
+            _last_narrow_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out)
+            return
+
+        def first(k: int, y0: int, y1: int) -> None:
+            start_narrow(workers[k])
+            first_narrow_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
+
+        def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
+            _last_narrow_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out)
+
+        _meet(first, last, height, threads)
 
     def _buffers(
-        self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace
+        self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace, margin: int = 0
     ) -> tuple[Penalties, NDArray[Any], list[PathBuffers]]:
-        """Return the penalties, the volume of sums and the buffers of each sweep."""
+        """Return the penalties, the volume of sums and the buffers of each sweep, with a margin around path costs."""
         penalties = self.penalties(cost.cost_max, cost.unit)
         height, width = shape
         size = width * levels.padded
@@ -176,7 +209,7 @@ class Sgm:
         sums_dtype = np.uint8 if (3 if diagonals else 1) * most <= 255 else np.uint16
         across_dtype = np.uint8 if 2 * most <= 255 else np.uint16
         sums = workspace.array("sgm.sums", height * size if two_sweeps else 1, sums_dtype)
-        recovers = self.paths == 4 and cost.costly_to_recompute
+        recovers = self.paths == 4 and cost.costly_to_recompute and margin == 0
         path_minimum = workspace.array("sgm.path_minimum", height * width if recovers else 0, np.uint8)
         whole = levels.count == levels.padded  # or the 255 of levels that pad would wrap, and might win
         padding = np.zeros(levels.padded, np.uint8)
@@ -191,8 +224,8 @@ class Sgm:
                 byte_brackets=whole and (5 if diagonals else 3) * most + (cost.cost_max if recovers else 0) <= 255,
                 cost=workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
                 across=workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
-                chains=workspace.array(f"sgm.chains{k}", 4 * levels.padded, np.uint8),
-                state=workspace.array(f"sgm.state{k}", 3 * size, np.uint8),
+                chains=workspace.array(f"sgm.chains{k}", 4 * levels.padded + 2 * margin, np.uint8),
+                state=workspace.array(f"sgm.state{k}", 3 * size + 2 * margin, np.uint8),
                 lowest=workspace.array(f"sgm.lowest{k}", 3 * width, np.uint8),
                 penalties=workspace.array(f"sgm.penalties{k}", 16 * width, np.uint8),
                 total=workspace.array(f"sgm.total{k}", CHUNK * levels.padded, np.uint16),
@@ -202,6 +235,42 @@ class Sgm:
             for k in range(2 if two_sweeps else 1)
         ]
         return penalties, sums, workers
+
+
+def _meet(first: Callable[..., None], last: Callable[..., None], height: int, threads: int) -> None:
+    """Let the down and the up sweep visit their own half of the rows first, and the other's last."""
+    middle = height // 2
+
+    def visit(name: str, function: Callable[..., None], *args: Any) -> None:
+        with span("match", name):
+            function(*args)
+
+    begin, end = (partial(visit, "sweep: first visit", first), partial(visit, "sweep: last visit", last))
+    run_stages(
+        [
+            [partial(begin, 0, 0, middle), partial(begin, 1, height - 1, middle - 1)],
+            [partial(end, 0, middle, height, 1, middle), partial(end, 1, middle - 1, -1, -1, height - middle)],
+        ],
+        threads,
+    )
+
+
+@kernel
+def _last_narrow_visit(
+    rows: Any, buffers: NarrowBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, step: int,
+    k0: int, sums: NDArray[Any], both: bool, out: SelectionOutput,
+) -> None:  # fmt: skip
+    """Sweep from row `y0` to before row `y1`, sum all paths and select; `k0` rows came before in this sweep."""
+    paths = buffers.paths
+    for k in range(abs(y1 - y0)):
+        y = y0 + k * step
+        half = k % 2
+        if half == 0:
+            prepare_narrow_rows(rows, buffers, guide, penalties, y, step, min(2, abs(y1 - y0) - k))
+        for x0 in range(0, paths.width, CHUNK):
+            x1 = min(x0 + CHUNK, paths.width)
+            finish_narrow_part(buffers, guide, half, y, step, k0 + k, x0, x1, sums, both)
+            select_row(paths.total, paths.total, x1 - x0, paths.blocks, y * paths.width + x0, out)
 
 
 @kernel

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import CellMask, CostInput, cell_mask, implements, mask_row, pad_pair
+from stereokit.costs.rows import CellMask, CostInput, cell_mask, implements, mask_narrow_row, mask_row, pad_pair
 from stereokit.errors import OptionError, shown
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, add, bitwise_or, count_bits, load, mark_less, splat, store, xor
@@ -44,6 +44,13 @@ class CensusRows(NamedTuple):
     right_stride: int
 
 
+class NarrowCensusRows(NamedTuple):
+    """Byte planes of both images, for pixels that search `LANES` levels from `starts` on."""
+
+    planes: CensusRows
+    starts: NDArray[np.int16]  # (H * W)
+
+
 @COSTS.register("census")
 @dataclass(frozen=True)
 class Census:
@@ -57,6 +64,7 @@ class Census:
 
     window: str = "9x7"
     name: ClassVar[str] = "census"
+    narrow: ClassVar[bool] = True
     cuda: ClassVar[str] = "stereokit.costs.census_cuda"
 
     def __post_init__(self) -> None:
@@ -85,7 +93,7 @@ class Census:
         """Whether a row costs more to compute again than to bring back from a volume."""
         return self.window == "9x7"
 
-    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[CensusRows]:
+    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[Any]:
         """Transform both images; return the row producers of `workers` sweeps."""
         height, width = pair.left.shape
         across, down = (size // 2 for size in WINDOWS[self.window])
@@ -114,7 +122,7 @@ class Census:
             right=right_planes,
             right_stride=right_stride,
         )
-        return [rows] * workers
+        return [rows if pair.starts is None else NarrowCensusRows(rows, pair.starts.ravel())] * workers
 
 
 @kernel
@@ -153,3 +161,22 @@ def _census_row(rows: CensusRows, y: int, out: NDArray[np.uint8]) -> None:
                 cost = add(cost, count_bits(xor(left_bits, right_bits)))
             store(out, x * LANES * len(cells.blocks) + block, cost)
     mask_row(cells, y, out)
+
+
+@implements(NarrowCensusRows)
+@kernel
+def _narrow_census_row(rows: NarrowCensusRows, y: int, out: NDArray[np.uint8]) -> None:
+    planes = rows.planes
+    width = planes.cells.width
+    count = len(planes.planes)
+    left = y * count * planes.left_stride
+    right = y * count * planes.right_stride
+    for x in range(width):
+        k = width - 1 - x + np.int64(rows.starts[y * width + x])
+        cost = splat(np.uint8(0))
+        for p in range(count):
+            left_bits = splat(planes.left[left + p * planes.left_stride + x])
+            right_bits = load(planes.right, right + p * planes.right_stride + k)
+            cost = add(cost, count_bits(xor(left_bits, right_bits)))
+        store(out, x * LANES, cost)
+    mask_narrow_row(planes.cells, rows.starts, y, out)

@@ -42,6 +42,7 @@ __all__ = [
     "cell_mask",
     "cost_row",
     "implements",
+    "mask_narrow_row",
     "mask_row",
     "pad_pair",
     "produce_volume",
@@ -85,6 +86,8 @@ class CostInput:
     ranges : ((int, int), (int, int)) or None
         Smallest and largest value of the left and of the right image, where these are windows of larger ones; None
         where they are whole.
+    starts : (H, W) int16, C-contiguous, or None
+        First level of each pixel's search, which takes `LANES` levels; None where all pixels try all levels.
     """
 
     left: NDArray[Any]
@@ -95,6 +98,7 @@ class CostInput:
     border_share: float | None
     threads: int = 1
     ranges: tuple[tuple[int, int], tuple[int, int]] | None = None
+    starts: NDArray[np.int16] | None = None
 
 
 class Cost(Protocol):
@@ -243,6 +247,21 @@ def mask_row(cells: CellMask, y: int, out: NDArray[np.uint8]) -> None:
         padding = load(cells.padding, last)
         for x in range(cells.width):
             store(out, x * cells.padded + last, bitwise_or(load(out, x * cells.padded + last), padding))
+
+
+@kernel
+def mask_narrow_row(cells: CellMask, starts: NDArray[np.int16], y: int, out: NDArray[np.uint8]) -> None:
+    """Set the cells of row `y` without evidence to the border's cost; a pixel has the `LANES` levels from its start."""
+    for x in range(cells.width):
+        start = np.int64(starts[y * cells.width + x])
+        column = x - cells.minimum - start  # right column of the first level
+        at = x * LANES
+        if cells.stride > 0 or column >= cells.width or column - LANES + 1 < 0:
+            right = y * cells.stride + cells.width - 1 - x + start
+            cost = minimum(maximum(load(out, at), load(cells.low, right)), load(cells.high, right))
+            store(out, at, cost)
+        if cells.left_bad.size > 0 and cells.left_bad[y * cells.width + x] != 0:
+            store(out, at, splat(cells.border_cost))
 
 
 @kernel

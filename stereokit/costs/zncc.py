@@ -32,7 +32,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import CellMask, CostInput, cell_mask, implements, mask_row
+from stereokit.costs.rows import CellMask, CostInput, cell_mask, implements, mask_narrow_row, mask_row
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer
 from stereokit.kernels.jit import by_types, inline, kernel
@@ -97,6 +97,17 @@ class ZnccRows(NamedTuple):
     wide_steps: tuple[int, ...]  # not empty when steps do not fit a signed byte; known to the compiler
 
 
+class NarrowZnccRows(NamedTuple):
+    """The same for pixels that search `LANES` levels from `starts` on.
+
+    Nothing slides from row to row there: `columns` has the pairs and the factors of all rows of a window, two rows to
+    a lane, and `sums` those of the columns of one window.
+    """
+
+    window: ZnccRows
+    starts: NDArray[np.int16]  # (H * W)
+
+
 @COSTS.register("zncc")
 @dataclass(frozen=True)
 class Zncc:
@@ -113,6 +124,7 @@ class Zncc:
     window: int = 5
     steps: int = 31
     name: ClassVar[str] = "zncc"
+    narrow: ClassVar[bool] = True
     cuda: ClassVar[str] = "stereokit.costs.zncc_cuda"
     needs_ranges: ClassVar[bool] = True
     bytes_per_pixel: ClassVar[int] = 4
@@ -149,7 +161,7 @@ class Zncc:
         """Whether a row costs more to compute again than to bring back from a volume."""
         return True
 
-    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[ZnccRows]:
+    def prepare(self, pair: CostInput, workspace: Workspace, workers: int) -> list[Any]:
         """Compute the window statistics; return the row producers of `workers` sweeps."""
         half = self.window // 2
         height, width = pair.left.shape
@@ -201,26 +213,26 @@ class Zncc:
             right_scale=right_scale.ravel(),
             right_width=right_width,
         )
-        producers = []
+        producers: list[Any] = []
+        sums, pairs = ((width + 2 * half) * padded, 1) if pair.starts is None else (self.window * LANES, half + 1)
         for worker in range(workers):
             columns = ColumnSums(
                 row=workspace.array(f"zncc.row{worker}", 1, np.int64),
-                sums=workspace.array(f"zncc.sums{worker}", (width + 2 * half) * padded, np.int32),
-                factors=workspace.array(f"zncc.factors{worker}", width + 2 * half, np.int32),
-                pairs=workspace.array(f"zncc.pairs{worker}", right_width + 2 * half, np.int32),
+                sums=workspace.array(f"zncc.sums{worker}", sums, np.int32),
+                factors=workspace.array(f"zncc.factors{worker}", pairs * (width + 2 * half), np.int32),
+                pairs=workspace.array(f"zncc.pairs{worker}", pairs * (right_width + 2 * half), np.int32),
             )
             columns.row[0] = -1
-            producers.append(
-                ZnccRows(
-                    cells=cells,
-                    half=half,
-                    images=images,
-                    statistics=statistics,
-                    columns=columns,
-                    steps=self.steps,
-                    wide_steps=(0,) if self.steps > 127 else (),
-                )
+            producer = ZnccRows(
+                cells=cells,
+                half=half,
+                images=images,
+                statistics=statistics,
+                columns=columns,
+                steps=self.steps,
+                wide_steps=(0,) if self.steps > 127 else (),
             )
+            producers.append(producer if pair.starts is None else NarrowZnccRows(producer, pair.starts.ravel()))
         return producers
 
     def _scale(self, low: int, high: int) -> tuple[int, np.float32]:
@@ -301,23 +313,35 @@ def _statistics(
 
 
 @inline
+def _write_pairs(rows: ZnccRows, place: int, low_row: int, high_row: int, low_n: int, high_n: int) -> None:
+    """Write two rows of the padded right image into the halves of lanes, and those of the left one times a factor.
+
+    `place` counts pairs of rows; a row that is -1 is none.
+    """
+    images = rows.images
+    new = max(low_row, 0) * images.right_stride
+    old = max(high_row, 0) * images.right_stride
+    at = place * images.right_stride
+    for k in range(images.right_stride):
+        low = np.int32(images.right[new + k]) & np.int32(0xFFFF)
+        high = np.int32(np.int32(images.right[old + k]) << np.int32(16))
+        rows.columns.pairs[at + k] = np.int32(low | high)
+    new = max(low_row, 0) * images.left_stride
+    old = max(high_row, 0) * images.left_stride
+    at = place * images.left_stride
+    n_low = np.int32(low_n) if low_row >= 0 else np.int32(0)
+    n_high = np.int32(high_n) if high_row >= 0 else np.int32(0)
+    for c in range(images.left_stride):
+        low = np.int32(n_low * np.int32(images.left[new + c])) & np.int32(0xFFFF)
+        high = np.int32(np.int32(n_high * np.int32(images.left[old + c])) << np.int32(16))
+        rows.columns.factors[at + c] = np.int32(low | high)
+
+
+@inline
 def _pair_rows(rows: ZnccRows, row_in: int, row_out: int) -> None:
     """Fill `pairs` and `factors` for a row of the padded images that comes and one that goes; -1 is none."""
-    new = max(row_in, 0) * rows.images.right_stride
-    old = max(row_out, 0) * rows.images.right_stride
-    for k in range(rows.columns.pairs.size):
-        low = np.int32(rows.images.right[new + k]) & np.int32(0xFFFF)
-        high = np.int32(np.int32(rows.images.right[old + k]) << np.int32(16))
-        rows.columns.pairs[k] = np.int32(low | high)
-    new = max(row_in, 0) * rows.images.left_stride
-    old = max(row_out, 0) * rows.images.left_stride
-    n = np.int32((2 * rows.half + 1) ** 2)
-    n_in = n if row_in >= 0 else np.int32(0)
-    n_out = np.int32(-n) if row_out >= 0 else np.int32(0)
-    for c in range(rows.columns.factors.size):
-        low = np.int32(n_in * np.int32(rows.images.left[new + c])) & np.int32(0xFFFF)
-        high = np.int32(np.int32(n_out * np.int32(rows.images.left[old + c])) << np.int32(16))
-        rows.columns.factors[c] = np.int32(low | high)
+    n = (2 * rows.half + 1) ** 2
+    _write_pairs(rows, 0, row_in, row_out, n, -n)
 
 
 @inline
@@ -359,6 +383,16 @@ def _to_costs(rho: Any, steps: Any, wide: Any) -> Any:
     return of_words if len(wide) > 0 else of_bytes
 
 
+@inline
+def _cost_of(rows: ZnccRows, y: int, x: int, k: int, total: Any) -> Any:
+    """Return the costs of 64 levels of a pixel whose first right pixel is element `k`, from n times their products."""
+    left_sum = splat_at(rows.statistics.left_sum, y * rows.cells.width + x)
+    numerator = add(total, multiply_pairs(load(rows.statistics.right_sum, k), left_sum))
+    rho = multiply(convert(numerator, np.float32(0)), load(rows.statistics.right_scale, k))
+    rho = multiply(rho, splat_at(rows.statistics.left_scale, y * rows.cells.width + x))
+    return _to_costs(rho, rows.steps, rows.wide_steps)
+
+
 @implements(ZnccRows)
 @kernel
 def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
@@ -391,10 +425,48 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
             at = base + x * LANES  # of the oldest column
             total = add(total, _column(rows, at + (window - 1) * LANES, x + window - 1, block))
             k = y * rows.statistics.right_width + cells.width - 1 - x + block
-            left_sum = splat_at(rows.statistics.left_sum, y * cells.width + x)
-            numerator = add(total, multiply_pairs(load(rows.statistics.right_sum, k), left_sum))
-            rho = multiply(convert(numerator, np.float32(0)), load(rows.statistics.right_scale, k))
-            rho = multiply(rho, splat_at(rows.statistics.left_scale, y * cells.width + x))
-            store(out, x * padded + block, _to_costs(rho, rows.steps, rows.wide_steps))
+            store(out, x * padded + block, _cost_of(rows, y, x, k, total))
             total = subtract(total, load(rows.columns.sums, at))
     mask_row(cells, y, out)
+
+
+@inline
+def _narrow_column(rows: ZnccRows, c: int, start: int) -> Any:
+    """Return n times the products of padded column `c` of the window, for the levels from `start` on."""
+    total = splat(np.int32(0))
+    for pair in range(rows.half + 1):
+        right = load(rows.columns.pairs, pair * rows.images.right_stride + rows.images.left_stride - 1 - c + start)
+        factors = splat_at(rows.columns.factors, pair * rows.images.left_stride + c)
+        total = add(total, multiply_pairs(right, factors))
+    return total
+
+
+@implements(NarrowZnccRows)
+@kernel
+def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, out: NDArray[np.uint8]) -> None:
+    rows = narrow.window
+    cells = rows.cells
+    window = 2 * rows.half + 1
+    n = window * window
+    for pair in range(rows.half + 1):
+        _write_pairs(rows, pair, y + 2 * pair, y + 2 * pair + 1 if pair < rows.half else -1, n, n)
+    sums = rows.columns.sums
+    before = np.int64(-1)
+    total = splat(np.int32(0))
+    for x in range(cells.width):
+        start = np.int64(narrow.starts[y * cells.width + x])
+        if start == before:  # the window slides: its oldest column leaves, in whose place the next one is kept
+            at = (x - 1) % window * LANES
+            column = _narrow_column(rows, x + window - 1, start)
+            total = add(subtract(total, load(sums, at)), column)
+            store(sums, at, column)
+        else:
+            total = splat(np.int32(0))
+            for c in range(x, x + window):
+                column = _narrow_column(rows, c, start)
+                total = add(total, column)
+                store(sums, c % window * LANES, column)
+        before = start
+        k = y * rows.statistics.right_width + cells.width - 1 - x + start
+        store(out, x * LANES, _cost_of(rows, y, x, k, total))
+    mask_narrow_row(cells, narrow.starts, y, out)

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.images.check import checked_image
+from stereokit.kernels.jit import kernel
 from stereokit.notices import collecting, warn
 
 __all__ = [
@@ -252,17 +253,26 @@ def missing_pixels(block: NDArray[Any], nodata: float | None) -> NDArray[np.bool
 
 
 def fill_bad(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return `image` with bad pixels replaced by the nearest good one before them on the row, else behind."""
-    width = image.shape[1]
-    columns = np.where(bad, -1, np.arange(width))
-    previous = np.maximum.accumulate(columns, axis=1)
-    columns = np.where(bad, width, np.arange(width))
-    following = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
-    source = np.where(previous >= 0, previous, following)
-    empty = source >= width
-    filled = np.take_along_axis(image, np.where(empty, 0, source), axis=1)
-    filled[empty] = 0
-    return np.asarray(filled)
+    """Return `image` with bad pixels replaced by the nearest good one before them on the row, else behind, else 0."""
+    filled = np.array(image, order="C")
+    bits = filled.view(f"u{filled.dtype.itemsize}")  # zero is zero in every type
+    _fill_rows(bits, np.ascontiguousarray(bad))
+    return filled
+
+
+@kernel
+def _fill_rows(bits: NDArray[Any], bad: NDArray[np.bool_]) -> None:
+    height, width = bits.shape
+    for y in range(height):
+        good = 0
+        while good < width and bad[y, good]:
+            good += 1
+        value = bits[y, good] if good < width else bits[y, 0] ^ bits[y, 0]
+        for x in range(width):
+            if bad[y, x]:
+                bits[y, x] = value
+            else:
+                value = bits[y, x]
 
 
 def scale_guide(image: NDArray[Any], low: int, high: int) -> NDArray[np.uint8]:

@@ -32,6 +32,7 @@ class Workspace:
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray[Any, Any]] = {}
         self._cached: dict[str, tuple[Hashable, Any]] = {}
+        self._parts: dict[str, Workspace] = {}
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike) -> np.ndarray[Any, Any]:
         """Return the array called `name`, C-contiguous and 64-byte aligned; its content is whatever it was."""
@@ -51,10 +52,14 @@ class Workspace:
         value: T = entry[1]
         return value
 
+    def part(self, name: str) -> Workspace:
+        """Return the workspace called `name` within this one, with names of its own."""
+        return self._parts.setdefault(name, Workspace())
+
     @property
     def nbytes(self) -> int:
         """Bytes of all arrays."""
-        return sum(a.nbytes for a in self._arrays.values())
+        return sum(a.nbytes for a in self._arrays.values()) + sum(part.nbytes for part in self._parts.values())
 
 
 class Pool(Generic[T]):

@@ -19,7 +19,7 @@ from stereokit.kernels.workspace import Workspace
 from stereokit.postprocess.fill import fill_empty_rows, fill_rows
 from stereokit.postprocess.median import median_rows
 from stereokit.postprocess.smp import resolve_rows
-from stereokit.postprocess.speckle import erase, find_regions, join_rows
+from stereokit.postprocess.speckle import erase, find_regions, join_rows, region_buffers
 
 __all__ = ["PostProcessing", "post_process"]
 
@@ -74,9 +74,10 @@ def post_process(
     parts = spans(height, threads)
     flat = disparity.reshape(-1)
     valid = np.empty(disparity.shape, np.bool_)
-    owners = workspace.array("smp.owners", (len(parts), width), np.int32)
-    size = flat.size if steps.speckle else 0
-    label, parent, count = (workspace.array(f"speckle.{name}", size, np.int32) for name in ("label", "parent", "count"))
+    scratch = workspace.array("smp.scratch", (len(parts), 2 * width + 2), np.int32)
+    lowest = workspace.array("smp.lowest", (len(parts), width + 1), cost.dtype)
+    is_loser = workspace.array("smp.is_loser", (len(parts), width + 1), np.uint8)
+    regions = region_buffers((height, width) if steps.speckle else (0, 0), len(parts), workspace)
     limit = np.float32(1)
     out = np.empty_like(disparity)
     incomplete: list[int] = []  # bands with rows that have no pixel to be filled from
@@ -85,17 +86,17 @@ def post_process(
         if bad is not None:
             disparity[y0:y1][bad[y0:y1]] = np.nan
         if steps.smp:
-            resolve_rows(disparity, cost, y0, y1, owners[k])
+            resolve_rows(disparity, cost, y0, y1, scratch[k], lowest[k], is_loser[k])
         if steps.speckle:
-            find_regions(flat, width, y0, y1, limit, label, parent, count)
+            find_regions(flat, width, k, y0, y1, limit, regions)
 
     def join() -> None:
         for y0, _ in parts[1:]:
-            join_rows(flat, width, y0, limit, label, parent, count)
+            join_rows(flat, width, y0, limit, regions)
 
     def clean(y0: int, y1: int) -> None:
         if steps.speckle:
-            erase(flat, y0 * width, y1 * width, steps.speckle, label, parent, count)
+            erase(flat, y0 * width, y1 * width, steps.speckle, regions)
         np.equal(disparity[y0:y1], disparity[y0:y1], out=valid[y0:y1])  # NaN is not
         if steps.fill is not None and fill_rows(disparity, y0, y1, steps.fill == "nearest"):
             incomplete.append(y0)

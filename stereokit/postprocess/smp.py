@@ -54,8 +54,11 @@ def single_matching_phase(
         raise InputError(f"cost must have the shape of disparity {out.shape}, got {cost.shape}")
     cost = np.ascontiguousarray(cost, None if cost.dtype in _COSTS else np.float64)
     parts = spans(out.shape[0], threads)
-    owners = np.empty((len(parts), out.shape[1]), np.int32)
-    run([partial(resolve_rows, out, cost, y0, y1, owners[k]) for k, (y0, y1) in enumerate(parts)], threads)
+    scratch = np.empty((len(parts), 2 * out.shape[1] + 2), np.int32)
+    lowest = np.zeros((len(parts), out.shape[1] + 1), cost.dtype)
+    is_loser = np.empty((len(parts), out.shape[1] + 1), np.uint8)
+    buffers = zip(scratch, lowest, is_loser, strict=True)
+    run([partial(resolve_rows, out, cost, *part, *own) for part, own in zip(parts, buffers, strict=True)], threads)
     return out
 
 
@@ -71,24 +74,32 @@ def right_column(x: int, d: np.float32, width: int) -> int:
 
 @kernel
 def resolve_rows(
-    disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int, owner: NDArray[np.int32]
-) -> None:
-    """Invalidate the losers of rows y0..y1, in place; `owner` has a place for each column."""
+    disparity: NDArray[np.float32], cost: NDArray[Any], y0: int, y1: int, scratch: NDArray[np.int32],
+    lowest: NDArray[Any], is_loser: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Invalidate the losers of rows y0..y1, in place.
+
+    Buffers have a place for each column and one more, `scratch` twice as many; `lowest` is of the type of `cost`. No
+    branch depends on the image: whoever loses a right column is marked, where nobody does the place behind the row.
+    Of equal costs the later pixel wins: as both match one column, its disparity is the larger one.
+    """
     width = disparity.shape[1]
+    owner = scratch[: width + 1]
+    columns = scratch[width + 1 :]
     for y in range(y0, y1):
         row = disparity[y]
-        owner[:] = -1
+        costs = cost[y]
+        owner[:] = width
+        is_loser[:] = 0
         for x in range(width):
-            d = row[x]
-            xr = right_column(x, d, width)
-            if xr < 0:
-                row[x] = np.nan
-                continue
-            rival = owner[xr]
-            if rival < 0:
-                owner[xr] = np.int32(x)
-            elif cost[y, x] < cost[y, rival] or (cost[y, x] == cost[y, rival] and d > row[rival]):
-                row[rival] = np.nan
-                owner[xr] = np.int32(x)
-            else:
-                row[x] = np.nan
+            column = right_column(x, row[x], width)
+            columns[x] = column if column >= 0 else width  # matches outside meet in a place of their own
+        for x in range(width):
+            to = np.int64(columns[x])
+            before = np.int64(owner[to])
+            wins = before == width or costs[x] <= lowest[to]
+            is_loser[before if wins else x] = 1
+            owner[to] = np.int32(x) if wins else np.int32(before)
+            lowest[to] = costs[x] if wins else lowest[to]
+        for x in range(width):
+            row[x] = np.float32(np.nan) if is_loser[x] != 0 or columns[x] == width else row[x]

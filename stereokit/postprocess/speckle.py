@@ -9,6 +9,7 @@ regions of few pixels become invalid. Regions are found by union-find over the r
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,11 @@ from numpy.typing import NDArray
 from stereokit.images.check import check_integer, check_number
 from stereokit.images.maps import check_threads, checked_map
 from stereokit.kernels.jit import inline, kernel
+from stereokit.kernels.simd import LANES, first_bit, load, mask_equal, splat
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
-__all__ = ["alike", "erase", "find_regions", "join_rows", "remove_speckles"]
+__all__ = ["Regions", "alike", "erase", "find_regions", "join_rows", "region_buffers", "remove_speckles"]
 
 
 def remove_speckles(
@@ -54,21 +56,42 @@ def remove_speckles(
     limit = np.float32(check_number("difference", difference, 0, 1e6))
     out = checked_map(disparity)
     size = min(size, out.size)
-    buffers = workspace or Workspace()
-    label, parent, count = (
-        buffers.array(f"speckle.{name}", out.size, np.int32) for name in ("label", "parent", "count")
-    )
-    width = out.shape[1]
+    height, width = out.shape
     flat = out.reshape(-1)
-    parts = spans(out.shape[0], threads)
-    run([partial(find_regions, flat, width, y0, y1, limit, label, parent, count) for y0, y1 in parts], threads)
+    parts = spans(height, threads)
+    regions = region_buffers((height, width), len(parts), workspace or Workspace())
+    run([partial(find_regions, flat, width, k, y0, y1, limit, regions) for k, (y0, y1) in enumerate(parts)], threads)
     for y0, _ in parts[1:]:
-        join_rows(flat, width, y0, limit, label, parent, count)
-    run(
-        [partial(erase, flat, y0 * width, y1 * width, size, label, parent, count) for y0, y1 in parts],
-        threads,
-    )
+        join_rows(flat, width, y0, limit, regions)
+    run([partial(erase, flat, y0 * width, y1 * width, size, regions) for y0, y1 in parts], threads)
     return out
+
+
+class Regions(NamedTuple):
+    """Runs of a map, pixels of a row of which each is like the one before, and the regions that they form.
+
+    Runs are numbered from left to right and from top to bottom in each band of rows, from the number of the band's
+    first pixel on. A run ends where the next one begins.
+    """
+
+    begin: NDArray[np.int32]  # (H * W + 1): first pixel of each run
+    parent: NDArray[np.int32]  # an older run of the same region, or the run itself
+    pixels: NDArray[np.int32]  # of the region of a run that is its own parent
+    rows: NDArray[np.int32]  # (H): first run of each row
+    marks: NDArray[np.uint8]  # (bands, 4 * stride): scratch, see `find_regions`
+
+
+def region_buffers(shape: tuple[int, int], bands: int, workspace: Workspace) -> Regions:
+    """Return the buffers for a map that is worked on in so many bands at a time."""
+    height, width = shape
+    stride = -(-width // LANES) * LANES
+    return Regions(
+        begin=workspace.array("speckle.begin", height * width + 1, np.int32),
+        parent=workspace.array("speckle.parent", height * width, np.int32),
+        pixels=workspace.array("speckle.pixels", height * width, np.int32),
+        rows=workspace.array("speckle.rows", height, np.int32),
+        marks=workspace.array("speckle.marks", (bands, 4 * stride), np.uint8),
+    )
 
 
 @inline
@@ -79,7 +102,7 @@ def alike(a: np.float32, b: np.float32, limit: np.float32) -> bool:
 
 
 @inline
-def _unite(parent: NDArray[np.int32], count: NDArray[np.int32], a: int, b: int) -> None:
+def _unite(parent: NDArray[np.int32], pixels: NDArray[np.int32], a: int, b: int) -> None:
     """Join two regions under the older one, which then holds the pixels of both."""
     while parent[a] != a:
         parent[a] = parent[parent[a]]
@@ -91,78 +114,110 @@ def _unite(parent: NDArray[np.int32], count: NDArray[np.int32], a: int, b: int) 
         first = min(a, b)
         second = max(a, b)
         parent[second] = first
-        count[first] += count[second]
+        pixels[first] += pixels[second]
+
+
+@inline
+def _mark(
+    disparity: NDArray[np.float32], at: int, above: int, width: int, limit: np.float32, breaks: NDArray[np.uint8],
+    breaks_above: NDArray[np.uint8], likes: NDArray[np.uint8], joins: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Mark where runs begin in the row of pixel `at`, and where they first touch a run of the row of pixel `above`.
+
+    A pixel that is like the one above it says nothing new where the pixels before are alike too, and both runs go on.
+    """
+    row = disparity[at : at + width]
+    upper = disparity[above : above + width]
+    breaks[0] = 1
+    for x in range(1, width):
+        invalid = row[x] != row[x] and row[x - 1] != row[x - 1]
+        breaks[x] = 0 if alike(row[x], row[x - 1], limit) or invalid else 1
+    for x in range(width):
+        likes[x] = 1 if alike(row[x], upper[x], limit) else 0
+    joins[0] = likes[0]
+    for x in range(1, width):
+        joins[x] = likes[x] & (breaks[x] | breaks_above[x] | (likes[x - 1] ^ np.uint8(1)))
+
+
+@inline
+def _run_with(begin: NDArray[np.int32], first: int, pixel: int) -> int:
+    """Return the run that has a pixel: `first`, or one behind it."""
+    while begin[first + 1] <= pixel:
+        first += 1
+    return first
 
 
 @kernel
 def find_regions(
-    disparity: NDArray[np.float32], width: int, y0: int, y1: int, limit: np.float32, label: NDArray[np.int32],
-    parent: NDArray[np.int32], count: NDArray[np.int32],
-) -> None:  # fmt: skip
-    """Label the runs of rows y0..y1 of the flat map and join those that touch; labels start at the first pixel's."""
-    fresh = y0 * width
+    disparity: NDArray[np.float32], width: int, band: int, y0: int, y1: int, limit: np.float32, regions: Regions
+) -> None:
+    """Find the runs of rows y0..y1 of the flat map and join those that touch.
+
+    Neighbours that are NaN are a run too, which touches no other.
+    """
+    marks = regions.marks[band]
+    stride = marks.size // 4
+    marks[:] = 0
+    likes = marks[2 * stride : 3 * stride]
+    joins = marks[3 * stride :]
+    one = splat(np.uint8(1))
+    begin = regions.begin
+    fresh = np.int64(y0) * width
+    above = fresh
     for y in range(y0, y1):
-        end = (y + 1) * width
-        above = y > y0
-        at = y * width
-        while at < end:
-            d = disparity[at]
-            if np.isnan(d):
-                label[at] = -1
-                at += 1
-                continue
-            own = np.int64(fresh)
-            fresh += 1
-            parent[own] = np.int32(own)
-            count[own] = 0
-            start = at
-            joined = np.int32(-1)  # the label above that this run was last joined to
-            while True:
-                label[at] = np.int32(own)
-                if above and alike(d, disparity[at - width], limit) and label[at - width] != joined:
-                    joined = label[at - width]
-                    _unite(parent, count, own, np.int64(joined))
-                at += 1
-                if at >= end:
-                    break
-                before = d
-                d = disparity[at]
-                if not alike(d, before, limit):
-                    break
-            root = own
-            while parent[root] != root:
-                root = np.int64(parent[root])
-            count[root] += np.int32(at - start)
+        at = np.int64(y) * width
+        place = (y & 1) * stride
+        breaks = marks[place : place + stride]
+        breaks_above = marks[stride - place : 2 * stride - place]
+        first = fresh
+        _mark(disparity, at, max(at - width, y0 * width), width, limit, breaks, breaks_above, likes, joins)
+        for block in range(0, stride, LANES):
+            mask = mask_equal(load(breaks, block), one)
+            while mask != 0:
+                begin[fresh] = at + block + first_bit(mask)
+                fresh += 1
+                mask &= mask - np.uint64(1)
+        begin[fresh] = at + width
+        regions.rows[y] = first
+        for k in range(first, fresh):
+            regions.parent[k] = k
+            regions.pixels[k] = begin[k + 1] - begin[k]
+        if y > y0:
+            here = first
+            for block in range(0, stride, LANES):
+                mask = mask_equal(load(joins, block), one)
+                while mask != 0:
+                    pixel = at + block + first_bit(mask)
+                    here = _run_with(begin, here, pixel)
+                    above = _run_with(begin, above, pixel - width)
+                    _unite(regions.parent, regions.pixels, above, here)
+                    mask &= mask - np.uint64(1)
+        above = first
 
 
 @kernel
-def join_rows(
-    disparity: NDArray[np.float32], width: int, y: int, limit: np.float32, label: NDArray[np.int32],
-    parent: NDArray[np.int32], count: NDArray[np.int32],
-) -> None:  # fmt: skip
+def join_rows(disparity: NDArray[np.float32], width: int, y: int, limit: np.float32, regions: Regions) -> None:
     """Join the regions of row `y` of the flat map with those of the row above."""
+    here = np.int64(regions.rows[y])
+    above = np.int64(regions.rows[y - 1])
     for at in range(y * width, (y + 1) * width):
         if alike(disparity[at], disparity[at - width], limit):
-            _unite(parent, count, np.int64(label[at]), np.int64(label[at - width]))
+            here = _run_with(regions.begin, here, at)
+            above = _run_with(regions.begin, above, at - width)
+            _unite(regions.parent, regions.pixels, above, here)
 
 
 @kernel
-def erase(
-    disparity: NDArray[np.float32], start: int, stop: int, size: int, label: NDArray[np.int32],
-    parent: NDArray[np.int32], count: NDArray[np.int32],
-) -> None:  # fmt: skip
-    """Invalidate the pixels of small regions; flat range start..stop."""
-    last = np.int32(-1)
-    small = False
-    for at in range(start, stop):
-        own = label[at]
-        if own < 0:
-            continue
-        if own != last:
-            root = np.int64(own)
-            while parent[root] != root:
-                root = np.int64(parent[root])
-            small = count[root] <= size
-            last = own
-        if small:
-            disparity[at] = np.nan
+def erase(disparity: NDArray[np.float32], start: int, stop: int, size: int, regions: Regions) -> None:
+    """Invalidate the pixels of small regions in a band; flat range start..stop."""
+    begin = regions.begin
+    k = np.int64(start)
+    while begin[k] < stop:
+        root = np.int64(regions.parent[k])
+        while regions.parent[root] != root:
+            root = np.int64(regions.parent[root])
+        regions.parent[k] = root  # later runs of the region need one step; other bands read an ancestor either way
+        if regions.pixels[root] <= size:
+            for at in range(begin[k], begin[k + 1]):
+                disparity[at] = np.nan
+        k += 1

@@ -29,7 +29,8 @@ class SelectionOutput(NamedTuple):
     cost: NDArray[Any]  # aggregated cost of the winner
     confidence: NDArray[np.float32]  # or empty, when nobody asked for it
     candidates: NDArray[np.float32]  # the winners again, then the best that are not next to them; or empty
-    levels: int
+    starts: NDArray[np.int16]  # first level of each pixel's search; empty where it is 0 everywhere
+    levels: int  # that each pixel searches
     minimum: int
     subpixel: bool
     uniqueness: np.float32  # margin to the best rival below which a pixel is invalid, 0 to 1
@@ -76,7 +77,10 @@ def select_pixel(
     """
     _, level = _best_level(keys, at, blocks)
     best = np.float32(values[at + level])
-    disparity = np.float32(level + out.minimum)
+    minimum = out.minimum
+    if out.starts.size > 0:
+        minimum += np.int64(out.starts[to])
+    disparity = np.float32(level + minimum)
     if out.subpixel and level > 0 and level < out.levels - 1:
         before = np.float32(values[at + level - 1])
         behind = np.float32(values[at + level + 1])
@@ -90,7 +94,7 @@ def select_pixel(
             out.confidence[to] = margin
         if out.candidates.size > 0:
             out.candidates[to] = disparity
-            out.candidates[out.candidates.size // 2 + to] = np.float32(other + out.minimum)
+            out.candidates[out.candidates.size // 2 + to] = np.float32(other + minimum)
         if margin < out.uniqueness:
             out.disparity[to] = np.nan
 
@@ -128,7 +132,7 @@ def select_row(
 def selection_output(
     disparity: NDArray[np.float32], cost: NDArray[Any], confidence: NDArray[np.float32] | None,
     levels: int, minimum_disparity: int, subpixel: bool, uniqueness: float = 0.0,
-    candidates: NDArray[np.float32] | None = None,
+    candidates: NDArray[np.float32] | None = None, starts: NDArray[np.int16] | None = None,
 ) -> SelectionOutput:  # fmt: skip
     """Return the flat view of the maps that kernels write; `candidates` come with a `confidence` only."""
     empty = np.empty(0, np.float32)
@@ -137,6 +141,7 @@ def selection_output(
         cost=cost.ravel(),
         confidence=empty if confidence is None else confidence.ravel(),
         candidates=empty if candidates is None else candidates.ravel(),
+        starts=np.empty(0, np.int16) if starts is None else starts.ravel(),
         levels=levels,
         minimum=minimum_disparity,
         subpixel=subpixel,

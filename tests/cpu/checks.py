@@ -282,6 +282,53 @@ def map_of(shape, seed, gaps, low=-3, high=12):
     return disparity
 
 
+def check_narrow(p1=3, p2=17, high=256, paths=(4, 8)):
+    """Compare searches of 64 levels that begin elsewhere at every pixel."""
+    from stereokit import Census
+    from stereokit.aggregation.sgm import Sgm
+    from stereokit.costs.rows import CostInput, Levels
+    from stereokit.kernels.workspace import Workspace
+    from stereokit.selection.wta import selection_output
+
+    shape, levels, cost = (5, 8), Levels(-3, 150), Census("5x5")
+    left, right, volume = census_volume(shape, -3, 150, "5x5", 0.5, 6, high)
+    starts = np.random.default_rng(7).choice([0, 7, 86], shape).astype(np.int16)
+    for count in paths:
+        total = oracles.narrow_sgm(volume, starts, 64, p1, p2, oracles.DIRECTIONS[count])
+        own = np.stack([[total[y, x, s:][:64] for x, s in enumerate(row)] for y, row in enumerate(starts)])
+        expected, expected_cost, _ = oracles.select(own, -3)
+        workspace, disparity = Workspace(), np.empty(shape, np.float32)
+        best = np.empty(shape, np.uint16)
+        out = selection_output(disparity, best, None, 64, -3, True, 0, None, starts)
+        rows = cost.prepare(CostInput(left, right, None, None, levels, 0.5, 1, None, starts), workspace, 2)
+        stage = Sgm(p1=p1, p2=p2, paths=count, edge_factor=1.0)
+        stage.sweep(rows, levels, cost, left, workspace, 1, out, starts=starts)
+        np.testing.assert_array_equal(best, expected_cost)
+        np.testing.assert_allclose(disparity, expected + starts, atol=1e-5)
+
+
+def check_narrow_worst():
+    """Compare with the largest penalties that bytes allow."""
+    check_narrow(231, 231, 2, (4,))
+
+
+def check_narrow_zncc(shape=(5, 12), window=5):
+    """Compare rows of searches that begin anew after every third pixel with the same levels of the loops."""
+    from stereokit import Zncc
+    from stereokit.costs.rows import CostInput, Levels, cost_row
+    from stereokit.kernels.workspace import Workspace
+
+    left, right, expected = zncc_volume(shape, -2, 100, window)
+    starts = np.random.default_rng(3).choice([0, 8, 36], (shape[0], shape[1] // 3)).repeat(3, axis=1).astype(np.int16)
+    pair = CostInput(left, right, None, None, Levels(-2, 100), 1.0, 1, None, starts)
+    (rows,) = Zncc(window, 31).prepare(pair, Workspace(), 1)
+    for y in (0, 3, 2):
+        out = np.full(shape[1] * 64, 77, np.uint8)
+        cost_row(rows, y, out)
+        wanted = np.array([expected[y, x, s:][:64] for x, s in enumerate(starts[y])]) * 31
+        assert np.abs(out.reshape(wanted.shape) - wanted).max() <= 0.5 + 1e-4 * 31
+
+
 def check_smp():
     """Compare the single matching phase, with many equal costs."""
     from stereokit.postprocess import single_matching_phase
@@ -327,6 +374,8 @@ def check_speckle():
         expected = oracles.remove_speckles(disparity, size)
         for threads in (1, 3):
             np.testing.assert_array_equal(remove_speckles(disparity, size, threads=threads), expected)
+    meeting = np.array([[0, 1, 2, 3, 4, 5, 6], [4] * 7], np.float32)  # two runs that are alike only in their middles
+    np.testing.assert_array_equal(remove_speckles(meeting, 7), meeting)
 
 
 CHECKS = {name.removeprefix("check_"): value for name, value in vars().copy().items() if name.startswith("check_")}

@@ -142,8 +142,7 @@ MUTANTS = [
     ),
     Mutant(
         "the row that goes is added", "costs.zncc",
-        "n_out = np.int32(-n) if row_out >= 0 else np.int32(0)", "n_out = n if row_out >= 0 else np.int32(0)",
-        _RULE, "zncc",
+        "_write_pairs(rows, 0, row_in, row_out, n, -n)", "_write_pairs(rows, 0, row_in, row_out, n, n)", _RULE, "zncc",
     ),
     Mutant(
         "the row that goes is one too low on the way up", "costs.zncc",
@@ -234,14 +233,74 @@ MUTANTS = [
         "columns begin with the state of the band before", "aggregation.dt",
         "state[:] = none", "", _UNWRITTEN, "sum",
     ),
+    # ------------------------------------------------------------------ narrow searches
+    Mutant(
+        "levels out of line with the pixel before", "aggregation.paths.narrow",
+        "bitwise_or(load(costs, place + shift), load(edges, LANES + shift))",
+        "bitwise_or(load(costs, place), load(edges, LANES + shift))", _RULE, "narrow",
+    ),
+    Mutant(
+        "levels that were not searched are free", "aggregation.paths.narrow",
+        "bitwise_or(load(costs, place + shift), load(edges, LANES + shift))", "load(costs, place + shift)",
+        _RULE, "narrow",
+    ),
+    Mutant(
+        "shifts of more than a search", "aggregation.paths.narrow",
+        "min(max(shift, -LANES), LANES)", "shift", _BOUNDS, "narrow",
+    ),
+    Mutant(
+        "path costs keep their smallest", "aggregation.paths.narrow",
+        "store(buffers.paths.state, LANES + slot * LANES, subtract(path_cost, smallest))",
+        "store(buffers.paths.state, LANES + slot * LANES, path_cost)", _OVERFLOW, "narrow_worst",
+    ),
+    Mutant(
+        "the up sweep looks at the row above", "aggregation.paths.narrow",
+        "here - step * width", "here - width", _RULE, "narrow",
+    ),
+    Mutant(
+        "diagonal paths have the start of the pixel above", "aggregation.paths.narrow",
+        "_shift(buffers, here, before - 1)", "_shift(buffers, here, before)", _RULE, "narrow",
+    ),
+    Mutant(
+        "diagonal paths go on from the other side", "aggregation.paths.narrow",
+        "_restart(buffers, slots.from_left)", "pass", _BORDER, "narrow",
+    ),
+    Mutant(
+        "starts do not count in the costs", "costs.census",
+        "width - 1 - x + np.int64(rows.starts[y * width + x])", "width - 1 - x", _RULE, "narrow",
+    ),
+    Mutant(
+        "only the first level can leave the image", "costs.rows",
+        "column - LANES + 1 < 0", "column < 0", _BORDER, "narrow",
+    ),
+    Mutant(
+        "starts do not count in the map", "selection.wta",
+        "minimum += np.int64(out.starts[to])", "pass", _RULE, "narrow",
+    ),
+    Mutant(
+        "the column that leaves is the next one", "costs.zncc",
+        "at = (x - 1) % window * LANES", "at = x % window * LANES", _RULE, "narrow_zncc",
+    ),
+    Mutant(
+        "the oldest column stays in the window", "costs.zncc",
+        "add(subtract(total, load(sums, at)), column)", "add(total, column)", _RULE, "narrow_zncc",
+    ),
+    Mutant(
+        "the last row of a window has a partner", "costs.zncc",
+        "y + 2 * pair + 1 if pair < rows.half else -1", "y + 2 * pair + 1", _RULE, "narrow_zncc",
+    ),
     # ------------------------------------------------------------------ post-processing
     Mutant(
         "of equal costs the smaller disparity stays", "postprocess.smp",
-        "d > row[rival]", "d < row[rival]", _RULE, "smp",
+        "costs[x] <= lowest[to]", "costs[x] < lowest[to]", _RULE, "smp",
     ),
     Mutant(
         "owners of the row before", "postprocess.smp",
-        "owner[:] = -1", "", _UNWRITTEN, "smp",
+        "owner[:] = width", "", _UNWRITTEN, "smp",
+    ),
+    Mutant(
+        "matches outside stay", "postprocess.smp",
+        "is_loser[x] != 0 or columns[x] == width", "is_loser[x] != 0", _BORDER, "smp",
     ),
     Mutant(
         "matches are cut to whole columns", "postprocess.smp",
@@ -269,15 +328,24 @@ MUTANTS = [
     ),
     Mutant(
         "regions that join lose the pixels of one", "postprocess.speckle",
-        "count[first] += count[second]", "pass", _RULE, "speckle",
+        "pixels[first] += pixels[second]", "pass", _RULE, "speckle",
     ),
     Mutant(
         "regions of just the size stay", "postprocess.speckle",
-        "count[root] <= size", "count[root] < size", _RULE, "speckle",
+        "regions.pixels[root] <= size", "regions.pixels[root] < size", _RULE, "speckle",
+    ),
+    Mutant(
+        "runs join only where one begins", "postprocess.speckle",
+        "likes[x] & (breaks[x] | breaks_above[x] | (likes[x - 1] ^ np.uint8(1)))",
+        "likes[x] & (breaks[x] | breaks_above[x])", _RULE, "speckle",
+    ),
+    Mutant(
+        "the last run of a row has no end", "postprocess.speckle",
+        "begin[fresh] = at + width", "pass", _BOUNDS, "speckle",
     ),
     Mutant(
         "bands are joined one row too low", "postprocess.speckle",
-        "range(y * width, (y + 1) * width)", "range((y + 1) * width, (y + 2) * width)", _RULE, "speckle",
+        "range(y * width, (y + 1) * width)", "range((y + 1) * width, (y + 2) * width)", _BOUNDS, "speckle",
     ),
 ]  # fmt: skip
 

@@ -11,7 +11,7 @@ import stereokit
 from stereokit import Matcher
 from stereokit.errors import StereokitWarning
 from stereokit.images.gray import gray_pair
-from stereokit.images.intensity import display_8bit
+from stereokit.images.intensity import display_8bit, fill_bad
 
 METHODS = tuple(stereokit.METHODS)
 SHIFT = 9
@@ -307,3 +307,15 @@ def test_images_are_shown_over_the_range_that_they_have(scene):
     assert (shown[:, :5] == 0).all()
     np.testing.assert_array_equal(shown[:, 5:], color[:, 5:])
     assert (display_8bit(image, nodata=int(image[0, 0]))[image == image[0, 0]] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+def test_bad_pixels_take_the_last_good_one_of_their_row(dtype):
+    image = np.arange(1, 22).reshape(3, 7).astype(dtype)
+    bad = np.array([[1, 1, 0, 0, 1, 1, 0], [0, 0, 1, 0, 0, 1, 1], [1] * 7], bool)
+    wanted = np.array([[3, 3, 3, 4, 4, 4, 7], [8, 9, 9, 11, 12, 12, 12], [0] * 7], dtype)
+    for layout in (np.ascontiguousarray, np.asfortranarray):
+        filled = fill_bad(layout(image), layout(bad))
+        np.testing.assert_array_equal(filled, wanted)
+        assert filled.dtype == dtype
+    assert image[0, 0] == 1  # what came in stays

@@ -39,7 +39,7 @@ from stereokit.kernels.simd import (
     subtract,
 )
 
-__all__ = ["CHUNK", "finish_part", "first_visit", "prepare_rows", "start"]
+__all__ = ["CHUNK", "add_others", "finish_part", "first_visit", "prepare_rows", "start", "sum_of_sweep"]
 
 
 CHUNK = 32
@@ -221,7 +221,7 @@ def prepare_rows(
 
 
 @inline
-def _sum_of_sweep(buffers: PathBuffers, cost: Any, brackets: Any) -> Any:
+def sum_of_sweep(buffers: PathBuffers, cost: Any, brackets: Any) -> Any:
     """Costs of all paths and brackets of this sweep, as words; path costs that the other sweep left hold one cost."""
     wide = np.uint16(0)
     if buffers.byte_costs:
@@ -233,7 +233,7 @@ def _sum_of_sweep(buffers: PathBuffers, cost: Any, brackets: Any) -> Any:
 
 
 @inline
-def _add_others(buffers: PathBuffers, total: Any, across: Any, sums: NDArray[Any], at: int, both: bool) -> Any:
+def add_others(buffers: PathBuffers, total: Any, across: Any, sums: NDArray[Any], at: int, both: bool) -> Any:
     """Add the brackets along the row and, if there are `both` sweeps, what the other one left at element `at`."""
     narrow = np.uint8(0)
     wide = np.uint16(0)
@@ -268,8 +268,8 @@ def _sum_part(
             brackets, _, paths = advance_paths(buffers, paths, n, cost, sums[0])
             if both and not recovers_costs(buffers):
                 prefetch(sums, base + at + CHUNK * padded)
-            total = _sum_of_sweep(buffers, cost, brackets)
-            total = _add_others(buffers, total, load(buffers.across, row + at), sums, base + at, both)
+            total = sum_of_sweep(buffers, cost, brackets)
+            total = add_others(buffers, total, load(buffers.across, row + at), sums, base + at, both)
             store(buffers.total, at - x0 * padded, total)
         leave_paths(buffers, slots, paths)
 

@@ -30,6 +30,7 @@ from stereokit_evaluation.data.datasets import dataset_names
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.data.published import PAPER
 from stereokit_evaluation.data.splits import comparison, count_frames
+from stereokit_evaluation.report.exports import write_exports
 from stereokit_evaluation.scoring.outside import is_function, outside_methods
 from stereokit_evaluation.scoring.runner import seen_in_training
 from stereokit_evaluation.study.configurations import (
@@ -231,6 +232,9 @@ def study(
         "versions": versions(),
         "machine": machine_info,
     }
+    write_json(make_folder(output) / "study.json", document)
+    if used:
+        write_exports(document, output)
     if not write_json(json_file, document):
         _print(parts, studies, documents, document)
     if report and used:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from stereokit import Matcher, __version__
 from stereokit.calibration import read_calibration
@@ -37,8 +38,10 @@ from stereokit.cli.pair import (
 )
 from stereokit.cli.rig import AlphaOption, RigOption, check_rig_options, read_rig_option
 from stereokit.errors import InputError, OptionError
-from stereokit.io import check_output, read_disparity, write_bytes
+from stereokit.io import IMAGE_SUFFIXES, check_output, read_disparity, read_image, write_bytes
 from stereokit.matching import compile_kernels
+from stereokit.notices import PairWarning, collecting, warn
+from stereokit.pairs import check_pair
 from stereokit_evaluation.common.weights import check_weights, weights_option
 from stereokit_evaluation.report import viewer
 from stereokit_evaluation.report.page import render, require
@@ -77,14 +80,22 @@ def view(
     nodata: NodataOption = None,
     align: AlignOption = False,
     strict: StrictOption = False,
-    truth: Annotated[Path | None, typer.Option(metavar="FILE", help="True disparity, for errors.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="True disparity, of occluded pixels too where it is known.")
+    ] = None,
+    seen: Annotated[
+        Path | None,
+        typer.Option(
+            "--noc", metavar="FILE", help="Truth of what both cameras see: a map, or a mask that is white there."
+        ),
+    ] = None,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Match LEFT and RIGHT and write a page with image, disparity, error and point cloud.
+    """Match LEFT and RIGHT and write a page with both images, disparity, error, differences and point cloud.
 
-    Without a calibration there is no depth, and the point cloud is in pixels. With --rig the images are raw ones, and
-    are rectified first.
+    What looks wrong with the pair is said on the page and on standard error. Without a calibration there is no depth,
+    and the point cloud is in pixels. With --rig the images are raw ones, and are rectified first.
     """
     check_output(output, (".html", ".htm"), "output")
     check_json(json_file)
@@ -113,41 +124,90 @@ def view(
     if rig is not None:
         rectification = read_rig_option(rig, size).rectification(alpha=alpha)
         images, masks, camera = rectification(*images), rectification.masks, rectification.calibration
-    true_disparity = None if truth is None else read_disparity(truth)
-    if true_disparity is not None and true_disparity.shape != images[0].shape[:2]:
-        raise InputError(f"truth must have the size of the images, {images[0].shape[:2]}, got {true_disparity.shape}")
+    noc, occ = _read_truth(truth, seen, images[0].shape[:2])
     masks = joined_masks(masks, mask, right_mask, images[0].shape[:2])
     if align:
         images = images[0], aligned(*images, nodata)
-    maps, seconds = [], {}
+    maps: list[viewer.MethodMap] = []
+    figures: list[dict[str, Any]] = []
+    warnings = _lesser_faults(images, max_disparity, min_disparity)
     for name, matcher in matchers.items():
         compile_kernels(matcher, images[0].shape[2:], images[0].dtype)  # the time below is that of matching
-        with strictly(strict):
+        with collecting() as lines, strictly(strict):
             start = time.perf_counter()
             result = matcher(*images, **masks)
-            seconds[name] = time.perf_counter() - start
-        note = f"{1000 * seconds[name]:.0f} ms"
-        if true_disparity is not None:
-            d1 = score(result.disparity, occ=true_disparity, measured=result.valid).occ.all.filled.d1()
-            note += "" if d1 is None else f", D1 {d1:.2f} %"
-        maps.append(viewer.MethodMap(name, result.disparity, result.valid, note))
-    picture = images[0] if images[0].ndim == 2 else images[0][:, :, :3]
-    pair = viewer.pair(left.name, picture, maps, occ=true_disparity, calibration=camera)
+            seconds = time.perf_counter() - start
+        warnings += [line for line in lines if line not in warnings]
+        counts = score(result.disparity, noc=noc, occ=occ, measured=result.valid)
+        figures.append(
+            {
+                "name": name,
+                "ms": 1000 * seconds,
+                "density": 100 * float(np.mean(result.valid)),
+                "d1_noc": counts.noc.all.filled.d1(),
+                "d1_all": counts.occ.all.filled.d1(),
+            }
+        )
+        maps.append(viewer.MethodMap(name, result.disparity, result.valid, _note(figures[-1])))
+    for line in warnings:
+        warn(line, PairWarning)
+    pictures = [image if image.ndim == 2 else image[:, :, :3] for image in images]
+    pair = viewer.pair(left.name, pictures[0], maps, right=pictures[1], noc=noc, occ=occ, calibration=camera)
     page = render(
         "view.html.j2", [pair], title=_title(left, right), version=__version__,
-        maps=maps, methods=[maps[0].name, maps[-1].name],
+        figures=figures, warnings=warnings, methods=[maps[0].name, maps[-1].name],
     )  # fmt: skip
     write_bytes(output, page)
+    seconds_by_name = {row["name"]: row["ms"] / 1000 for row in figures}
     report = {
         "left": str(left), "right": None if right is None else str(right), "output": str(output), "bytes": len(page),
-        "methods": list(matchers), "seconds": seconds, "calibration": None if calibration is None else str(calibration),
-        "density": {shown.name: float(np.mean(shown.valid)) for shown in maps}, "version": __version__,
+        "methods": list(matchers), "seconds": seconds_by_name,
+        "calibration": None if calibration is None else str(calibration),
+        "density": {row["name"]: row["density"] / 100 for row in figures}, "figures": figures, "warnings": warnings,
+        "version": __version__,
     }  # fmt: skip
     if not write_json(json_file, report):
         hint = "" if camera is not None else "; no calibration: no depth, and the point cloud is in pixels"
         typer.echo(f"{output} ({len(page) / 1e6:.1f} MB){hint}")
     if open_browser:
         webbrowser.open(output.resolve().as_uri())
+
+
+def _read_truth(
+    truth: Path | None, seen: Path | None, size: tuple[int, ...]
+) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+    """Return the true disparity of the pixels that both cameras see, and of all pixels; None where it is not known."""
+    occ = None if truth is None else read_disparity(truth)
+    if occ is not None and occ.shape != size:
+        raise InputError(f"truth must have the size of the images, {size}, got {occ.shape}")
+    if seen is None:
+        return None, occ
+    mask = read_image(seen, gray=True) if seen.suffix.lower() in IMAGE_SUFFIXES else None
+    noc: NDArray[np.float32]
+    if mask is None or mask.dtype != np.uint8:
+        noc = read_disparity(seen)
+    elif occ is None:
+        raise OptionError(f"noc must go with --truth where it is a mask, got {str(seen)!r} alone")
+    elif mask.shape == size:
+        noc = np.where(mask == 255, occ, np.float32(np.nan))
+    else:
+        noc = mask  # of another size, which is refused below
+    if noc.shape != size:
+        raise InputError(f"noc must have the size of the images, {size}, got {noc.shape}")
+    return noc, occ
+
+
+def _lesser_faults(images: tuple[NDArray[Any], NDArray[Any]], max_disparity: int, min_disparity: int) -> list[str]:
+    """Return what is worth knowing of a pair, in lines; what is seriously wrong with it the matcher says itself."""
+    report = check_pair(*images, max_disparity=max_disparity, min_disparity=min_disparity)
+    return [fault.message for fault in report.faults if not fault.serious]
+
+
+def _note(row: dict[str, Any]) -> str:
+    """Return the figures of a method in a few words, for the viewer."""
+    errors = ((name, row[key]) for name, key in (("D1 noc", "d1_noc"), ("D1 all", "d1_all")))
+    words = [f"{name} {value:.2f} %" for name, value in errors if value is not None]
+    return ", ".join([*words, f"density {row['density']:.0f} %"])
 
 
 def _title(left: Path, right: Path | None) -> str:

@@ -1,7 +1,11 @@
 """The charts of the report as Plotly figures (plain dictionaries): the paper's bar charts and its accuracy-time plot.
 
-Published figures are hatched bars and hollow markers, ours solid ones, so that they differ by more than colour.
-Colours are those of Okabe and Ito (2008), which the colour-blind can distinguish.
+Bars lie, a row each, with their names beside them, so that no label can meet another. Published figures are hatched
+bars and hollow markers, ours solid ones; a setting has a colour and a marker of its own. Colours are those of Okabe and
+Ito (2008), which the colour-blind can distinguish.
+
+Beside ``data`` and ``layout`` a figure may have ``variants`` (a trace's coordinates by region), ``height`` (pixels) and
+``title``. `stereokit_evaluation.report.static_charts` draws the same figures as SVG and PDF.
 """
 
 from __future__ import annotations
@@ -10,9 +14,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stereokit_evaluation.data import published
-from stereokit_evaluation.study.configurations import PAPER_VARIANTS, title
+from stereokit_evaluation.report.disturbance_charts import disturbance_charts
+from stereokit_evaluation.study.configurations import BASELINE, PAPER_VARIANTS, title
 
-__all__ = ["REGIONS", "accuracy_time", "bars", "colour"]
+__all__ = ["REGIONS", "accuracy_time", "bars", "colour", "figures", "row_name", "symbol"]
 
 REGIONS = {
     "noc all": "not occluded, all",
@@ -25,21 +30,54 @@ REGIONS = {
 """The regions of the charts, by the keys of the JSON joined with a blank."""
 
 _COLOURS = {"linear": "#56b4e9", "original": "#e69f00", "cnn": "#009e73", "stereovae": "#d55e00"}
-_OTHERS = ("#cc79a7", "#0072b2", "#f0e442")
+_OTHERS = ("#cc79a7", "#0072b2", "#b8a800", "#7a5195", "#4d8c3f", "#a05a2c")
+_SYMBOLS = {"linear": "triangle-up", "original": "circle", "cnn": "pentagon", "stereovae": "star"}
+_OTHER_SYMBOLS = ("triangle-down", "hexagon", "cross", "x", "hourglass", "bowtie")
 _TICKS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000]
 _BASELINE_COLOUR = "#8a8a8a"
+_ROW_PX, _FRAME_PX = 30, 110  # height of a row of bars, and of axis and legend
 
 JsonRow = Mapping[str, Any]
 
 
+def figures(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return all charts of a study's JSON, by the id of the element of the page that they go to."""
+    rows = document["results"]
+    charts = {
+        "chart-e4": bars(rows, "e4", document["dataset"]),
+        "chart-e5": bars(rows, "e5", document["dataset"]),
+        "chart-time": accuracy_time(rows),
+    }
+    faults = disturbance_charts(document.get("disturbances") or {})
+    return charts | {f"chart-fault-{kind}": _titled(kind, chart) for kind, chart in faults.items()}
+
+
+def _titled(kind: str, chart: dict[str, Any]) -> dict[str, Any]:
+    """Return a chart of lines with a title, and its legend on top, clear of the axis."""
+    layout = {**chart["layout"], "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom"}}
+    return {**chart, "layout": layout, "title": f"Error against {kind}"}
+
+
+def row_name(row: JsonRow) -> str:
+    """Return the name of a row of the study's JSON: ``"S4 Mini+Linear"``, ``"OpenCV HH"``, or its own ``name``."""
+    name: str | None = row.get("name")
+    return name or (row["matcher"] if row["setting"] == BASELINE else f"{row['matcher']} {row['setting']}")
+
+
 def colour(variant: str, variants: Sequence[str]) -> str:
-    """Return the colour of a variant; variants beyond the paper's share three."""
+    """Return the colour of a variant; variants beyond the paper's take turns with six."""
     others = [name for name in variants if name not in _COLOURS]
     return _COLOURS.get(variant) or _OTHERS[others.index(variant) % len(_OTHERS)]
 
 
+def symbol(variant: str, variants: Sequence[str]) -> str:
+    """Return the marker of a variant, as `colour` does."""
+    others = [name for name in variants if name not in _SYMBOLS]
+    return _SYMBOLS.get(variant) or _OTHER_SYMBOLS[others.index(variant) % len(_OTHER_SYMBOLS)]
+
+
 def bars(rows: Sequence[JsonRow], figure: str, name: str) -> dict[str, Any]:
-    """Return one of the paper's bar charts, with our bars and the published ones.
+    """Return one of the paper's bar charts, with our bars and the published ones: a row each, matcher by matcher.
 
     Parameters
     ----------
@@ -51,53 +89,63 @@ def bars(rows: Sequence[JsonRow], figure: str, name: str) -> dict[str, Any]:
         The data set, for the legend.
     """
     paper = {"e4": published.VALIDATION, "e5": published.TEST}[figure]
-    ours = [row for row in rows if row["setting"] != "peer"]
+    ours = [row for row in rows if row["setting"] != BASELINE]
     matchers = list(dict.fromkeys(row["matcher"] for row in ours))
-    ours_by_name = list(dict.fromkeys(_variant(row) for row in ours))
-    published_names = {name for part in paper.values() for name in part}
-    chart_variants = [s for s in (*PAPER_VARIANTS, *ours_by_name) if s in ours_by_name or s in published_names]
-    traces: list[dict[str, Any]] = []
-    heights_by_region: dict[str, list[Any]] = {region: [] for region in REGIONS}
-    for variant in dict.fromkeys(chart_variants):
-        color = colour(variant, chart_variants)
-        paper_values = [paper.get(matcher, {}).get(variant) for matcher in matchers]
-        if any(value is not None for value in paper_values):
-            pattern = {"shape": "/", "fgcolor": color, "bgcolor": "rgba(0,0,0,0)", "size": 6}
-            hatched = {"color": color, "pattern": pattern}
-            line = {"color": color, "width": 1.5}
-            traces.append(_bar(f"{title(variant)}, published", matchers, paper_values, {**hatched, "line": line}))
-            for values in heights_by_region.values():
-                values.append(paper_values)
-        cells = {row["matcher"]: row for row in ours if _variant(row) == variant and row["missing"] is None}
-        measured = {region: [_d1(cells[m], region) if m in cells else None for m in matchers] for region in REGIONS}
-        if cells:
-            traces.append(_bar(f"{title(variant)}, {name}", matchers, measured["noc all"], {"color": color}))
-            for region, values in heights_by_region.items():
-                values.append(measured[region])
-    heights = [y for values in heights_by_region.values() for bars in values for y in bars if y is not None]
-    room = 1.18 * max(heights, default=1.0)  # for the figures above the bars
+    variants = list(dict.fromkeys(_variant(row) for row in ours))
+    published_names = {variant for part in paper.values() for variant in part}
+    variants = list(dict.fromkeys(s for s in (*PAPER_VARIANTS, *variants) if s in variants or s in published_names))
+    measured = {(row["matcher"], _variant(row)): row for row in ours if row["missing"] is None}
+    cells = [(m, s) for m in matchers for s in variants if (m, s) in measured or s in paper.get(m, {})]
+    labels = [f"{matcher} {title(variant)}" for matcher, variant in cells]
+    colours = [colour(variant, variants) for _, variant in cells]
+    scored: list[JsonRow | None] = [measured.get(cell) for cell in cells]
+    for row in rows:
+        if row["setting"] == BASELINE and row["missing"] is None:
+            labels.append(row_name(row))
+            colours.append(_BASELINE_COLOUR)
+            scored.append(row)
+    printed = [paper.get(m, {}).get(s) for m, s in cells] + [None] * (len(labels) - len(cells))
+    values = {region: [None if row is None else _d1(row, region) for row in scored] for region in REGIONS}
+    hatched = {
+        "color": colours,
+        "pattern": {"shape": "/", "fgcolor": colours, "bgcolor": "rgba(0,0,0,0)", "size": 6},
+        "line": {"color": colours, "width": 1.5},
+    }
+    traces = [
+        _bar("published", labels, printed, hatched),
+        _bar(f"measured here, {name}", labels, values["noc all"], {"color": colours}),
+    ]
+    widths = [x for column in (printed, *values.values()) for x in column if x is not None]
     layout = {
         "barmode": "group",
-        "bargap": 0.18,
-        "yaxis": {"title": {"text": "D1 error, %"}, "range": [0, room]},
-        "legend": {"orientation": "h", "y": -0.16},
+        "bargap": 0.2,
+        "xaxis": {"title": {"text": "D1 error, %"}, "range": [0, 1.15 * max(widths, default=1.0)]},
+        "yaxis": {"autorange": "reversed", "ticks": ""},
+        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "traceorder": "normal"},
     }
-    return {"data": traces, "layout": layout, "variants": {"y": heights_by_region}}
+    by_region = {region: [printed, column] for region, column in values.items()}
+    height = _FRAME_PX + _ROW_PX * len(labels)
+    words = {"e4": "validation figures (fig. e4)", "e5": "test figures (fig. e5)"}[figure]
+    heading = f"D1 error beside the paper's {words}"
+    return {"data": traces, "layout": layout, "variants": {"x": by_region}, "height": height, "title": heading}
 
 
 def accuracy_time(rows: Sequence[JsonRow]) -> dict[str, Any]:
-    """Return the paper's figure 1: error against time, with ours and OpenCV's on this machine."""
+    """Return the paper's figure 1: error against time, with ours and other libraries' on this machine."""
     traces: list[dict[str, Any]] = []
     errors_by_region: dict[str, list[Any]] = {region: [] for region in REGIONS}
-    variants = list(dict.fromkeys(_variant(row) for row in rows if row["setting"] != "peer"))
-    groups = [(title(s), [r for r in rows if _variant(r) == s], colour(s, variants), "circle") for s in variants]
-    groups.append(("OpenCV", [row for row in rows if row["setting"] == "peer"], _BASELINE_COLOUR, "square"))
-    for name, members, color, symbol in groups:
+    variants = list(dict.fromkeys(_variant(row) for row in rows if row["setting"] != BASELINE))
+    groups = [
+        (title(s), [r for r in rows if r["setting"] != BASELINE and _variant(r) == s], colour(s, variants), s)
+        for s in variants
+    ]
+    groups.append(("other methods", [row for row in rows if row["setting"] == BASELINE], _BASELINE_COLOUR, ""))
+    for name, members, color, variant in groups:
         scored = [row for row in members if row["missing"] is None and row["ms"]]
         if not scored:
             continue
-        marker = {"color": color, "size": 12, "symbol": symbol}
-        labels = [row["matcher"].removeprefix("OpenCV ") for row in scored]
+        marker = {"color": color, "size": 12, "symbol": symbol(variant, variants) if variant else "square"}
+        labels = [row_name(row).removeprefix("OpenCV ") if not variant else row["matcher"] for row in scored]
         x = [_d1(row, "noc all") for row in scored]
         traces.append(_points(f"{name}, this machine", x, [row["ms"]["total"] for row in scored], labels, marker))
         for region, values in errors_by_region.items():
@@ -112,16 +160,17 @@ def accuracy_time(rows: Sequence[JsonRow]) -> dict[str, Any]:
     layout = {
         "xaxis": {"title": {"text": "D1 error, %"}, "rangemode": "tozero"},
         "yaxis": {"title": {"text": "time, ms"}, "type": "log", "tickvals": _TICKS, "ticktext": _TICKS},
-        "legend": {"orientation": "h", "y": -0.2},
+        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom"},
     }
-    return {"data": traces, "layout": layout, "variants": {"x": errors_by_region}}
+    return {"data": traces, "layout": layout, "variants": {"x": errors_by_region}, "title": "Accuracy against time"}
 
 
-def _bar(name: str, x: Sequence[str], y: Sequence[float | None], marker: dict[str, Any]) -> dict[str, Any]:
-    hover = "%{x}: %{y:.2f} %<extra>" + name + "</extra>"
-    labels = {"texttemplate": "%{y:.2f}", "textposition": "outside", "textangle": -90, "cliponaxis": False}
+def _bar(name: str, y: Sequence[str], x: Sequence[float | None], marker: dict[str, Any]) -> dict[str, Any]:
+    hover = "%{y}: %{x:.2f} %<extra>" + name + "</extra>"
+    labels = {"texttemplate": "%{x:.2f}", "textposition": "outside", "cliponaxis": False}
     labels |= {"textfont": {"size": 11}, "constraintext": "none"}
-    return {"type": "bar", "name": name, "x": list(x), "y": list(y), "marker": marker, "hovertemplate": hover, **labels}
+    trace = {"type": "bar", "orientation": "h", "name": name, "x": list(x), "y": list(y), "marker": marker}
+    return {**trace, "hovertemplate": hover, **labels}
 
 
 def _points(
@@ -140,7 +189,6 @@ def _points(
         "y": list(y),
         "text": list(text),
         "customdata": list(notes or [name] * len(x)),
-        "textposition": "top center",
         "marker": marker,
         "cliponaxis": False,
         "hovertemplate": "%{text}: %{x:.2f} %, %{y:.1f} ms<br>%{customdata}<extra></extra>",

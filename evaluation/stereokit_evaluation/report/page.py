@@ -1,4 +1,7 @@
-"""Reports as one HTML file that needs no network: charts, tables that sort, and a viewer of disparity maps.
+"""Reports as HTML that needs no network: charts, tables that sort, and a viewer of disparity maps.
+
+A report is one file. Where its maps would make that large, they lie in a folder beside it
+(`stereokit_evaluation.report.tiles`) and are read when they are looked at.
 
 Charts are drawn by Plotly, whose script comes with its Python package and is embedded compressed; the page undoes
 that itself. Template, style and scripts lie in ``assets``.
@@ -8,7 +11,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import json
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib import import_module
@@ -22,16 +24,23 @@ from stereokit.errors import StereokitError
 from stereokit.io import write_bytes
 from stereokit.notices import collecting
 from stereokit_evaluation.bench.stages import GROUPS, OTHER, TOTAL
+from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data import published
 from stereokit_evaluation.data.frame import Frame
-from stereokit_evaluation.report import charts, viewer
+from stereokit_evaluation.report import charts as _charts
+from stereokit_evaluation.report import viewer
+from stereokit_evaluation.report.disturbance_charts import FIGURE_TITLES
+from stereokit_evaluation.report.measures import COLUMNS, by_data_set, measure_rows
+from stereokit_evaluation.report.per_pair import per_pair
+from stereokit_evaluation.report.tiles import TileFolder, json_text
 from stereokit_evaluation.scoring.runner import Scored
 from stereokit_evaluation.study.run import Study, StudyRow
 from stereokit_evaluation.study.table import missing_lines
 
-__all__ = ["chosen_frames", "render", "require", "write_report"]
+__all__ = ["chosen_frames", "rate", "render", "require", "write_report"]
 
-_SCRIPTS = ("maps.js", "cloud.js", "viewer.js", "page.js")
+_SCRIPTS = ("maps.js", "cloud.js", "viewer.js", "pairs.js", "page.js")
+_LARGE = 50e6  # pixels of maps, some 35 MB, beyond which a folder takes them
 
 
 def write_report(path: Path, document: dict[str, Any], study: Study, frames: Sequence[Frame], show: int) -> int:
@@ -40,7 +49,7 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
     Parameters
     ----------
     path : Path
-        An HTML file.
+        An HTML file; the folder ``NAME_files`` beside it takes the maps where they are many.
     document : dict
         The study's JSON.
     study : Study
@@ -59,26 +68,35 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
     """
     rows = document["results"]
     title = f"{document['dataset']}{', ' + document['split'] if document['split'] else ''}"
-    figures = {
-        "chart-e4": charts.bars(rows, "e4", document["dataset"]),
-        "chart-e5": charts.bars(rows, "e5", document["dataset"]),
-        "chart-time": charts.accuracy_time(rows),
-    }
+    chosen = chosen_frames(frames, study.rows, show)
+    tiles = TileFolder(path) if _pixels(chosen, study.rows) > _LARGE else None
+    pairs = []
+    with progress(len(chosen)) as (_, step):
+        for frame in chosen:
+            pair = _viewer_pair(frame, study.rows)
+            pairs.append(pair if tiles is None else tiles.add(pair))
+            step(f"report: {frame.name}")
     page = render(
         "study.html.j2",
-        [_viewer_pair(frame, study.rows) for frame in chosen_frames(frames, study.rows, show)],
-        charts=figures,
+        pairs,
+        charts=_charts.figures(document),
         title=f"Robustness study: {title}",
         document=document,
         rows=rows,
+        measures=measure_rows(document),
+        measure_columns=COLUMNS,
+        data_sets=by_data_set(document),
+        per_pair=per_pair(rows, [frame.name for frame in chosen], digits=3),
         methods=_first_methods(study.rows),
-        regions=charts.REGIONS,
+        regions=_charts.REGIONS,
+        disturbances=document.get("disturbances") or {},
+        fault_figures=FIGURE_TITLES,
         stages=(TOTAL, *GROUPS, OTHER),
         missing=missing_lines(study.rows),
         published=published,
     )
     write_bytes(path, page)
-    return len(page)
+    return len(page) + (0 if tiles is None else tiles.bytes)
 
 
 def render(
@@ -91,7 +109,7 @@ def render(
     template : str
         A file of ``assets``.
     pairs : sequence of dict
-        Results of `stereokit_evaluation.report.viewer.pair`, for the viewer.
+        Results of `stereokit_evaluation.report.viewer.pair`, for the viewer, or of `TileFolder.add`.
     charts : dict, optional
         Plotly figures by the id of the element that they go to; without them the page has no Plotly.
     **content
@@ -111,8 +129,10 @@ def render(
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["json"] = lambda value: markup(_json(value))
+    environment.filters["json"] = lambda value: markup(json_text(value))
     environment.filters["figure"] = lambda value, digits=2: "\u2013" if value is None else f"{value:.{digits}f}"
+    environment.filters["rate"] = rate
+    environment.globals["row_name"] = _charts.row_name
     text: str = environment.get_template(template).render(
         pairs=pairs,
         constants=viewer.constants(),
@@ -123,6 +143,11 @@ def render(
         **content,
     )
     return text.encode()
+
+
+def rate(value: float) -> str:
+    """Return frames a second with two significant digits below ten, so that a slow method does not stand as 0."""
+    return f"{value:.0f}" if value >= 10 else f"{float(f'{value:.2g}'):g}"
 
 
 def chosen_frames(frames: Sequence[Frame], rows: Sequence[StudyRow], show: int) -> list[Frame]:
@@ -174,6 +199,7 @@ def _viewer_pair(frame: Frame, rows: Sequence[StudyRow]) -> dict[str, Any]:
         frame.name,
         frame.load_left(),
         maps,
+        right=frame.load_right(),
         noc=frame.load_noc(),
         occ=frame.load_occ(),
         calibration=frame.load_calibration(),
@@ -181,14 +207,18 @@ def _viewer_pair(frame: Frame, rows: Sequence[StudyRow]) -> dict[str, Any]:
 
 
 def _note(scored: Scored) -> str:
-    d1 = scored.score.main.filled.d1()
-    return "" if d1 is None else f"D1 {d1:.2f} %"
+    """Return a map's error, with the pixels that it counts, and its density."""
+    noc, occ = scored.score.noc.all, scored.score.occ.all
+    name, counts = ("D1 noc", noc) if noc.filled.pixels else ("D1 all", occ)
+    d1, density = counts.filled.d1(), counts.density()
+    return "" if d1 is None or density is None else f"{name} {d1:.2f} %, density {density:.0f} %"
 
 
-def _json(value: Any) -> str:
-    """Return JSON that may stand inside a script element."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+def _pixels(frames: Sequence[Frame], rows: Sequence[StudyRow]) -> int:
+    """Return how many pixels of maps the viewer shows, taking all frames for as large as the first."""
+    maps = sum(row.configuration.can_match and row.missing is None for row in rows)
+    size = int(np.prod(frames[0].load_left().shape[:2])) if frames else 0
+    return len(frames) * maps * size
 
 
 @lru_cache(maxsize=1)

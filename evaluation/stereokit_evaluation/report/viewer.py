@@ -1,4 +1,4 @@
-"""The data of the reports' viewer for one stereo pair: the left image, maps, truth, geometry.
+"""The data of the reports' viewer for one stereo pair: both images, maps, truth, geometry.
 
 The page draws pictures, errors and points itself from the maps (`stereokit_evaluation.report.packing`), so that
 hovering reads numbers and each further method costs one map.
@@ -23,9 +23,11 @@ from stereokit_evaluation.report.packing import pack_map, pack_mask
 from stereokit_evaluation.scoring.error_map import COLOURS, EDGES
 from stereokit_evaluation.scoring.kitti import D1_PIXELS, D1_SHARE, fill_background
 
-__all__ = ["MethodMap", "constants", "pair"]
+__all__ = ["MethodMap", "constants", "counted_pixels", "pair"]
 
 _JPEG_QUALITY = 85
+_DIFFERENCE = ((33, 102, 220), (245, 245, 245), (214, 70, 20))  # blue, white, red: A smaller, equal, larger
+_DIFFERENCE_PIXELS = 3.0  # beyond which the colour stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +53,13 @@ class MethodMap:
 
 
 def constants() -> dict[str, Any]:
-    """Return the constants for drawing any pair: Turbo's colours, and the colours and the rule of errors."""
+    """Return the constants for drawing any pair: Turbo's colours, those of errors and their rule, of differences."""
     ramp = np.linspace(0.0, 1.0, 256, dtype=np.float32)[None]
+    shades = [np.interp(np.linspace(0, 2, 65), (0, 1, 2), ends) for ends in zip(*_DIFFERENCE, strict=True)]
     return {
         "turbo": colorize(ramp, 0.0, 1.0)[0].tolist(),
         "error": {"colours": COLOURS, "edges": EDGES, "pixels": D1_PIXELS, "share": D1_SHARE},
+        "difference": {"colours": np.rint(shades).astype(int).T.tolist(), "pixels": _DIFFERENCE_PIXELS},
     }
 
 
@@ -64,6 +68,7 @@ def pair(
     left: NDArray[Any],
     maps: Sequence[MethodMap],
     *,
+    right: NDArray[Any] | None = None,
     noc: NDArray[np.float32] | None = None,
     occ: NDArray[np.float32] | None = None,
     calibration: Calibration | None = None,
@@ -75,9 +80,11 @@ def pair(
     name : str
     left : (H, W) or (H, W, 3), uint8, uint16 or float
         The left image.
-    maps : sequence of Shown
+    maps : sequence of MethodMap
         At least one, as large as `left`. Where one has no value it is filled as for scoring, and marked as not
         measured.
+    right : (H, W) or (H, W, 3), uint8, uint16 or float, optional
+        The right image.
     noc, occ : (H, W) float32, optional
         True disparity of the pixels that both cameras see, and of all pixels; NaN unknown.
     calibration : Calibration, optional
@@ -91,6 +98,8 @@ def pair(
     if not maps:
         raise InputError("maps must hold at least one map, got none")
     height, width = left.shape[:2]
+    if right is not None and right.shape[:2] != (height, width):
+        raise InputError(f"right must have the size of the left image, {(height, width)}, got {right.shape[:2]}")
     for label, array in (("noc", noc), ("occ", occ), *((method_map.name, method_map.disparity) for method_map in maps)):
         if array is not None and array.shape != (height, width):
             raise InputError(f"{label} must have the size of the left image, {(height, width)}, got {array.shape}")
@@ -102,13 +111,33 @@ def pair(
         "width": width,
         "height": height,
         "left": _jpeg(left),
+        "right": None if right is None else _jpeg(right),
         "bottom": bottom,
         "top": max(bottom + 1.0, top),
         "truth": None if truth is None else pack_map(truth),
+        "pixels": counted_pixels(noc, occ),
         "seen": None if noc is None or occ is None else pack_mask(np.isfinite(noc)),
         "calibration": None if calibration is None else _geometry(calibration, width, height),
         "maps": [_packed(method_map) for method_map in maps],
     }
+
+
+def counted_pixels(noc: NDArray[np.float32] | None, occ: NDArray[np.float32] | None) -> str:
+    """Return which pixels the errors of a pair count, in words; empty without ground truth."""
+    if noc is None and occ is None:
+        return ""
+    if occ is None:
+        return f"{_count(noc)} pixels that both cameras see have a true disparity; the others do not count."
+    if noc is None:
+        return f"{_count(occ)} pixels have a true disparity and count, occluded ones too where the truth has them."
+    return (
+        f"{_count(occ)} pixels have a true disparity (D1 all); both cameras see {_count(noc)} of them (D1 noc); "
+        "a pixel without a value is filled first."
+    )
+
+
+def _count(truth: NDArray[np.float32] | None) -> str:
+    return f"{0 if truth is None else int(np.count_nonzero(np.isfinite(truth))):,}"
 
 
 def _packed(method_map: MethodMap) -> dict[str, Any]:

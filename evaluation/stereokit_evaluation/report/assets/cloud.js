@@ -35,7 +35,7 @@ class Cloud {
 
   reset() {
     this.yaw = 0.15;
-    this.pitch = 0.12;
+    this.pitch = -0.22; // from above: the ground is in view
     this.near = 1;
   }
 
@@ -50,8 +50,8 @@ class Cloud {
     this.draw();
   }
 
-  // values: disparity; colours: the left picture's pixels; cut: metres beyond which points are left out.
-  set(values, width, height, colours, camera) {
+  // values: disparity; measured: which of them were not filled; colours: the left picture's pixels.
+  set(values, measured, width, height, colours, camera) {
     const points = new Float32Array(3 * values.length);
     const paint = new Uint32Array(values.length);
     const depths = [];
@@ -59,7 +59,7 @@ class Cloud {
     for (let y = 0, i = 0; y < height; y++) {
       for (let x = 0; x < width; x++, i++) {
         const d = values[i];
-        if (d !== d) continue;
+        if (d !== d || !measured[i]) continue; // what was filled is a guess, and the sky's is a bad one
         let p;
         if (camera) {
           const parallax = d + camera.doffs;
@@ -94,7 +94,8 @@ class Cloud {
     const depth = new Float32Array(w * h).fill(Infinity);
     const [cy, sy, cp, sp] = [Math.cos(this.yaw), Math.sin(this.yaw), Math.cos(this.pitch), Math.sin(this.pitch)];
     const focal = this.focal * w * this.near;
-    const away = this.metric ? this.middle : 1.1 * this.span * this.focal;
+    // From behind the cameras, so that the ground before them is in view too.
+    const away = this.metric ? 1.6 * this.middle : 1.1 * this.span * this.focal;
     for (let i = 0; i < this.count; i++) {
       const z0 = points[3 * i + 2];
       if (z0 > this.far) continue;

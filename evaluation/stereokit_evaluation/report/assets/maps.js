@@ -2,7 +2,12 @@
 "use strict";
 
 const Maps = (() => {
-  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  function bytes(text) {
+    const letters = atob(text);
+    const out = new Uint8Array(letters.length);
+    for (let i = 0; i < out.length; i++) out[i] = letters.charCodeAt(i);
+    return out;
+  }
 
   async function inflate(text, format = "deflate") {
     const stream = new Blob([bytes(text)]).stream().pipeThrough(new DecompressionStream(format));
@@ -89,7 +94,28 @@ const Maps = (() => {
     });
   }
 
-  async function leftPicture(uri, width, height) {
+  // Of two maps, or of their errors where there is truth: blue where A is smaller, or nearer to the truth, red where B is.
+  function differencePicture(a, b, truth, width, height, rule) {
+    const shade = Uint32Array.from(rule.colours, word);
+    const middle = (shade.length - 1) / 2;
+    let known = 0;
+    if (truth) for (let i = 0; i < truth.length; i++) if (truth[i] === truth[i]) known++;
+    const reach = truth && known < 0.5 * truth.length ? 1 : 0;
+    return picture(width, height, (pixels) => {
+      pixels.fill(0xff000000);
+      for (let y = 0, i = 0; y < height; y++) {
+        for (let x = 0; x < width; x++, i++) {
+          const change = truth ? Math.abs(a[i] - truth[i]) - Math.abs(b[i] - truth[i]) : a[i] - b[i];
+          if (change !== change) continue;
+          const colour = shade[Math.round(middle * (1 + Math.max(-1, Math.min(1, change / rule.pixels))))];
+          for (let v = Math.max(0, y - reach); v <= Math.min(height - 1, y + reach); v++)
+            for (let u = Math.max(0, x - reach); u <= Math.min(width - 1, x + reach); u++) pixels[v * width + u] = colour;
+        }
+      }
+    });
+  }
+
+  async function photograph(uri, width, height) {
     const image = new Image();
     image.src = uri;
     await image.decode();
@@ -98,5 +124,5 @@ const Maps = (() => {
     return target;
   }
 
-  return { inflate, map, mask, disparityPicture, errorPicture, leftPicture };
+  return { inflate, map, mask, disparityPicture, errorPicture, differencePicture, photograph };
 })();

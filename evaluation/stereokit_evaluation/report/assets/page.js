@@ -45,10 +45,23 @@ const Page = (() => {
     }
   }
 
+  // The viewer reads its first pair when it comes near.
+  function startViewer() {
+    const viewer = document.getElementById("viewer");
+    if (!viewer) return;
+    const watch = new IntersectionObserver((entries) => {
+      if (!entries.some((entry) => entry.isIntersecting)) return;
+      watch.disconnect();
+      Viewer.start();
+    }, { rootMargin: "300px" });
+    watch.observe(viewer);
+  }
+
   function start() {
     theme();
     sorting();
-    Viewer.start();
+    Pairs.start();
+    startViewer();
   }
 
   return { start, dark, onTheme: (tell) => listeners.push(tell) };

@@ -1,43 +1,120 @@
-// The viewer: left image, disparity and error of two methods with a slider between them, and numbers under the cursor.
+// The viewer: both images, disparity and error of two methods, with a slider between them or side by side, their
+// difference, and numbers under the cursor.
 "use strict";
+
+// Parts of the report that lie in files beside the page: scripts, because a page from a disk may not fetch.
+const Tiles = (() => {
+  const waiting = new Map();
+
+  function load(path) {
+    return new Promise((give, fail) => {
+      const script = document.createElement("script");
+      waiting.set(path, give);
+      script.src = path;
+      script.onerror = () => fail(new Error(`${path} cannot be read: the page needs the folder beside it`));
+      script.onload = () => script.remove(); // its content is with whoever asked, and nowhere else
+      document.head.append(script);
+    });
+  }
+
+  function put(path, content) {
+    waiting.get(path)?.(content);
+    waiting.delete(path);
+  }
+
+  return { load, put };
+})();
 
 const Viewer = (() => {
   const get = (id) => document.getElementById(id);
   const read = (id) => JSON.parse(get(id).textContent);
+  const MOST = 6; // decoded maps that are kept
+  const kept = []; // they themselves, the oldest first
   const text = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)}${unit}` : "–");
 
-  async function start() {
+  let started = null;
+  const start = () => (started ??= begin());
+
+  async function begin() {
     const root = get("viewer");
-    if (!root) return;
     const rules = read("constants");
-    const canvases = { left: get("view-left"), disparity: get("view-disparity"), error: get("view-error") };
-    const controls = { frame: get("frame"), a: get("method-a"), b: get("method-b"), slider: get("slider"), zoom: get("zoom") };
+    const canvases = {
+      left: get("view-left"), right: get("view-right"), disparity: get("view-disparity"), disparityB: get("view-disparity-b"),
+      error: get("view-error"), errorB: get("view-error-b"), difference: get("view-difference"),
+    };
+    const controls = {
+      frame: get("frame"), a: get("method-a"), b: get("method-b"), slider: get("slider"), zoom: get("zoom"),
+      layout: get("layout"), difference: get("difference"),
+    };
+    const side = () => controls.layout.value === "side" && state.a !== state.b;
     const cloud = new Cloud(get("view-cloud"));
     const state = { pair: null, a: null, b: null, x: 0, y: 0, cx: 0, cy: 0, cloud: false, load: 0 };
     const cache = new Map();
 
+    // A canvas without pixels gives its memory back at once, and not when the garbage is collected.
+    const free = (...pictures) => pictures.forEach((picture) => picture && (picture.width = 0));
+
+    function keep(entry) {
+      if (kept.includes(entry)) kept.splice(kept.indexOf(entry), 1);
+      kept.push(entry);
+      while (kept.length > MOST) {
+        const old = kept.shift();
+        free(old.decoded.disparity, old.decoded.error, old.decoded.differences?.picture);
+        delete old.decoded;
+      }
+      return entry.decoded;
+    }
+
     async function decoded(pair, index) {
-      const held = (pair.decoded ??= []);
-      if (held[index]) return held[index];
-      const { width, height } = pair;
       const entry = pair.maps[index];
-      const values = await Maps.map(entry.map);
-      const measured = await Maps.mask(entry.measured, width * height);
+      if (entry.decoded) return keep(entry);
+      const { width, height } = pair;
+      const packed = entry.tile ? await Tiles.load(entry.tile) : entry;
+      const values = await Maps.map(packed.map);
+      const measured = await Maps.mask(packed.measured, width * height);
       const error = pair.truthValues
         ? Maps.errorPicture(values, pair.truthValues, pair.seenValues, width, height, rules.error)
         : null;
       const disparity = Maps.disparityPicture(values, width, height, pair.bottom, pair.top, rules.turbo);
-      return (held[index] = { name: entry.name, values, measured, disparity, error });
+      entry.decoded = { name: entry.name, values, measured, disparity, error };
+      return keep(entry);
+    }
+
+    function difference(pair, a, b) {
+      const mode = pair.truthValues ? controls.difference.value : "disparity";
+      const key = `${mode} ${a.name}`;
+      if (b.differences?.key !== key) {
+        const truth = mode === "error" ? pair.truthValues : null;
+        b.differences = { key, picture: Maps.differencePicture(a.values, b.values, truth, pair.width, pair.height, rules.difference) };
+      }
+      return b.differences.picture;
     }
 
     async function pairAt(index) {
-      if (cache.has(index)) return cache.get(index);
-      const pair = read(`pair-${index}`);
+      if (cache.has(index)) {
+        const pair = cache.get(index);
+        cache.delete(index); // and to the end, as the newest
+        cache.set(index, pair);
+        return pair;
+      }
+      const tile = controls.frame.options[index].dataset.tile;
+      const pair = tile ? await Tiles.load(tile) : read(`pair-${index}`);
       const size = pair.width * pair.height;
       pair.truthValues = pair.truth && (await Maps.map(pair.truth));
       pair.seenValues = pair.seen && (await Maps.mask(pair.seen, size));
-      pair.picture = await Maps.leftPicture(pair.left, pair.width, pair.height);
-      if (cache.size > 2) cache.delete(cache.keys().next().value);
+      pair.picture = await Maps.photograph(pair.left, pair.width, pair.height);
+      pair.rightPicture = pair.right && (await Maps.photograph(pair.right, pair.width, pair.height));
+      if (cache.size > 1) {
+        const [oldest, old] = cache.entries().next().value;
+        cache.delete(oldest);
+        for (const entry of old.maps) {
+          if (!entry.decoded) continue;
+          kept.splice(kept.indexOf(entry), 1);
+          free(entry.decoded.disparity, entry.decoded.error, entry.decoded.differences?.picture);
+          delete entry.decoded;
+        }
+        free(old.picture, old.rightPicture);
+      }
       cache.set(index, pair);
       return pair;
     }
@@ -48,12 +125,23 @@ const Viewer = (() => {
       if (pair.maps.some((m) => m.name === before)) select.value = before;
     }
 
-    async function show(fresh) {
+    // An error is told in the page: the console is not where people look.
+    async function show(...what) {
+      try {
+        await load(...what);
+        get("trouble").hidden = true;
+      } catch (error) {
+        get("trouble").hidden = false;
+        get("trouble").textContent = error.message;
+      }
+    }
+
+    async function load(fresh, first, second) {
       const ticket = ++state.load;
       const pair = await pairAt(Number(controls.frame.value));
       if (fresh) {
-        options(controls.a, pair, state.pair ? undefined : root.dataset.a);
-        options(controls.b, pair, state.pair ? undefined : root.dataset.b);
+        options(controls.a, pair, first ?? (state.pair ? undefined : root.dataset.a));
+        options(controls.b, pair, second ?? (state.pair ? undefined : root.dataset.b));
       }
       const place = (name) => Math.max(0, pair.maps.findIndex((m) => m.name === name));
       const a = await decoded(pair, place(controls.a.value));
@@ -66,6 +154,18 @@ const Viewer = (() => {
       Object.assign(state, { pair, a, b });
       root.querySelector(".views").classList.toggle("blind", !pair.truthValues);
       root.querySelectorAll("[data-needs-truth]").forEach((e) => (e.hidden = !pair.truthValues));
+      const two = a !== b;
+      canvases.right.closest("figure").hidden = !pair.right;
+      for (const name of ["disparityB", "errorB"]) canvases[name].closest("figure").hidden = !side() || (name === "errorB" && !pair.truthValues);
+      canvases.difference.closest("figure").hidden = !two;
+      controls.slider.closest("label").hidden = get("flip").hidden = !two || side();
+      for (const e of root.querySelectorAll("[data-name]")) e.textContent = ({ a, b })[e.dataset.name].name;
+      for (const e of root.querySelectorAll("[data-only]"))
+        e.hidden = (e.dataset.only === "side") !== side() || ("two" in e.dataset && !two);
+      const worse = pair.truthValues && controls.difference.value === "error";
+      get("difference-low").textContent = worse ? "A nearer to the truth" : `A smaller, ${rules.difference.pixels} px`;
+      get("difference-high").textContent = worse ? "B nearer" : `A larger, ${rules.difference.pixels} px`;
+      get("pixels").textContent = pair.pixels ?? "";
       get("bottom").textContent = pair.bottom.toFixed(0);
       get("top").textContent = `${pair.top.toFixed(0)} px`;
       const step = [...controls.frame.options].findIndex((o) => o.selected);
@@ -88,20 +188,32 @@ const Viewer = (() => {
       const { pair, a, b } = state;
       if (!pair) return;
       const [x0, y0, w, h, zoom] = window_();
-      const cut = Math.round((pair.width * Number(controls.slider.value)) / 100);
+      const sliding = a !== b && !side();
+      const share = sliding ? Number(controls.slider.value) : 100;
+      const cut = Math.round((pair.width * share) / 100);
+      const both = (picture) => [picture, picture];
+      const pictures = {
+        left: both(pair.picture), right: both(pair.rightPicture),
+        disparity: [a.disparity, b.disparity], disparityB: both(side() ? b.disparity : null),
+        error: [a.error, b.error], errorB: both(side() ? b.error : null),
+        difference: both(a === b ? null : difference(pair, a, b)),
+      };
+      const shift = a.values[state.y * pair.width + state.x]; // where the right image has the same point
       for (const [name, canvas] of Object.entries(canvases)) {
         const context = canvas.getContext("2d");
         context.imageSmoothingEnabled = false;
-        const [first, second] = name === "left" ? [pair.picture, pair.picture] : [a[name], b[name]];
-        if (!first) continue;
+        const [first, second] = pictures[name];
+        if (!first?.width || !second.width) continue; // not there, or already given back
         context.drawImage(second, x0, y0, w, h, 0, 0, pair.width, pair.height);
         if (cut > 0) context.drawImage(first, x0, y0, cut / zoom, h, 0, 0, cut, pair.height);
         const thin = Math.max(1, pair.width / canvas.clientWidth);
-        if (name !== "left" && a !== b && cut > 0 && cut < pair.width) {
+        if (sliding && (name === "disparity" || name === "error") && cut > 0 && cut < pair.width) {
           context.fillStyle = "#fff";
           context.fillRect(cut - thin, 0, 2 * thin, pair.height);
         }
-        const [px, py] = [(state.x + 0.5 - x0) * zoom, (state.y + 0.5 - y0) * zoom];
+        if (name === "right" && shift !== shift) continue;
+        const column = name === "right" ? state.x - shift : state.x;
+        const [px, py] = [(column + 0.5 - x0) * zoom, (state.y + 0.5 - y0) * zoom];
         for (const [colour, width] of [["#000", 3 * thin], ["#fff", thin]]) {
           context.strokeStyle = colour;
           context.lineWidth = width;
@@ -150,10 +262,10 @@ const Viewer = (() => {
       const canvas = get("view-cloud");
       Object.assign(canvas, { width: Math.min(1242, pair.width), height: Math.round(Math.min(1242, pair.width) * 0.5) });
       const image = pair.picture.getContext("2d").getImageData(0, 0, pair.width, pair.height);
-      cloud.set(a.values, pair.width, pair.height, new Uint32Array(image.data.buffer), pair.calibration);
+      cloud.set(a.values, a.measured, pair.width, pair.height, new Uint32Array(image.data.buffer), pair.calibration);
       get("cloud-unit").textContent = pair.calibration
-        ? "metres, by the pair's calibration; the farthest points are left out"
-        : "no calibration: columns, rows and disparity, all in pixels";
+        ? "metres, by the pair's calibration; measured points only, the farthest left out"
+        : "no calibration: columns, rows and disparity, all in pixels; measured points only";
       canvas.dataset.points = String(cloud.count);
     }
 
@@ -182,7 +294,11 @@ const Viewer = (() => {
         }
         move(Math.floor(x), Math.floor(y), false);
       });
-      canvas.addEventListener("pointerdown", (e) => state.pair && move(...under(e).map(Math.floor), false));
+      canvas.addEventListener("pointerdown", (e) => {
+        if (!state.pair) return;
+        if (narrow.matches) canvas.closest("figure").after(get("readout")); // below the picture, and over none
+        move(...under(e).map(Math.floor), false);
+      });
       canvas.addEventListener("dblclick", (e) => {
         if (!state.pair) return;
         const [x, y] = under(e);
@@ -197,6 +313,12 @@ const Viewer = (() => {
         move(state.x + moves[e.key][0], state.y + moves[e.key][1], true);
       });
     }
+    const home = document.createComment("read-out");
+    get("readout").before(home);
+    const narrow = matchMedia("(max-width: 999px)");
+    narrow.addEventListener("change", () => home.after(get("readout")));
+    controls.layout.addEventListener("change", () => show(false));
+    controls.difference.addEventListener("change", () => show(false));
     controls.frame.addEventListener("change", () => show(true));
     controls.a.addEventListener("change", () => show(false));
     controls.b.addEventListener("change", () => show(false));
@@ -219,11 +341,22 @@ const Viewer = (() => {
       if (state.cloud) points();
     });
     get("turbo").style.background = `linear-gradient(to right, ${rules.turbo.filter((_, k) => k % 15 === 0).map((c) => `rgb(${c})`).join(", ")})`;
+    get("shades").style.background = `linear-gradient(to right, ${rules.difference.colours.map((c) => `rgb(${c})`).join(", ")})`;
     get("steps").replaceChildren(...rules.error.colours.map((c) => Object.assign(document.createElement("i"), { style: `background: rgb(${c})` })));
     if (root.dataset.cloud === "open") get("cloud-toggle").click();
     addEventListener("resize", draw);
+    choose = (frame, a, b) => {
+      controls.frame.selectedIndex = frame;
+      return show(true, a, b);
+    };
     await show(true);
   }
 
-  return { start };
+  let choose = null;
+  async function show(frame, a, b) {
+    await start();
+    return choose(frame, a, b);
+  }
+
+  return { start, show, kept: () => kept.length };
 })();

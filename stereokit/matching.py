@@ -76,8 +76,8 @@ class Matcher:
         without evidence, which match nothing and are never ``valid``; None leaves it to NaN, alpha and the marks that
         `stereokit.images.intensity` detects), ``confidence`` (bool), ``right`` (bool, the right view's map too;
         twice the time) and ``search`` ("full" tries all disparities at each pixel, "coarse-to-fine" 64 around the
-        map of half the size, so that time and memory do not grow with the range; "auto" does so from 129 on, with
-        S2 on the CPU). Defaults are those of `stereokit.defaults`.
+        map of half the size, so that time and memory do not grow with the range; "auto" does so with S2 at full
+        size from 65 on, on the CPU). Defaults are those of `stereokit.defaults`.
 
     Raises
     ------

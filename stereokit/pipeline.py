@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import CostInput, Levels, takes_8_bits
+from stereokit.costs.rows import CostInput, Levels, Search, takes_8_bits
 from stereokit.errors import OptionError
 from stereokit.images.evidence import blank_pixels, joined
 from stereokit.images.gray import GrayPair
@@ -24,7 +24,7 @@ from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.chain import post_process
 from stereokit.result import Disparity
-from stereokit.search import halved_levels, restore_thin, search_starts
+from stereokit.search import halved_levels, plan_search, restore_thin
 from stereokit.selection.wta import selection_output
 from stereokit.settings import Detail, MatchSettings
 
@@ -172,17 +172,23 @@ class CpuPipeline:
                 pair = reduced(pair, settings.step)
         return self._map(pair, settings.matched_levels, settings.detail, workspace, threads)
 
-    def _starts(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> NDArray[np.int16] | None:
-        """Return the first level of each pixel's search; None where every pixel searches all levels."""
-        if not self.settings.coarse_to_fine or levels.count <= LANES:
+    def _search(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Search | None:
+        """Return what each pixel tries; None where every pixel tries all levels."""
+        is_matched_size = levels == self.settings.matched_levels
+        if not self.settings.coarse_to_fine or levels.count < LANES + (0 if is_matched_size else 1):
             return None
         with span("prepare", "half size"):
             half = half_size(pair)
         coarse = self._map(half, halved_levels(levels), None, workspace.part("half"), threads)
         with span("prepare", "search ranges"):
-            starts = workspace.array("match.starts", pair.left.shape, np.int16)
-            search_starts(coarse.disparity, levels, starts)
-        return starts
+            shape = pair.left.shape
+            search = Search(
+                workspace.array("search.starts", shape, np.int16),
+                workspace.array("search.low", shape, np.uint8),
+                workspace.array("search.high", shape, np.uint8),
+            )
+            plan_search(coarse.disparity, coarse.valid, levels, search)
+        return search
 
     def _map(
         self, pair: GrayPair, levels: Levels, detail: Detail | None, workspace: Workspace, threads: int
@@ -190,7 +196,8 @@ class CpuPipeline:
         """Return the map of a pair at its own size; without a `detail`, filled and for the search of the next size."""
         settings = self.settings
         cost, aggregation = settings.cost, settings.aggregation
-        starts = self._starts(pair, levels, workspace, threads)
+        search = self._search(pair, levels, workspace, threads)
+        starts = None if search is None else search.starts
         guide = pair.guide
         with span("prepare", "smooth"):
             pair = smooth(pair, settings.smooth, workspace, threads, eight_bits=takes_8_bits(cost))
@@ -220,7 +227,7 @@ class CpuPipeline:
             disparity, total, confidence, searched, levels.minimum, settings.subpixel, settings.uniqueness,
             candidates, starts,
         )  # fmt: skip
-        keywords = {} if starts is None else {"starts": starts}
+        keywords: dict[str, Any] = {} if search is None else {"search": search}
         with span("match", "sweep, around its kernels"):
             aggregation.sweep(rows, levels, cost, guide, workspace, threads, out, **keywords)
         selected = None

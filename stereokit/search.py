@@ -1,7 +1,17 @@
 """Coarse to fine: a map of half the size tells each pixel where to search (after Rothermel et al. 2012, tSGM).
 
 A pixel searches `LANES` levels, however large the range is. They hold what the half-size map has around the pixel,
-and a margin; where it has more than fits, the pixel's own value decides. Ranges of no more levels are searched in full.
+and a margin; where it has more than fits, the pixel's own value decides.
+
+Where the half-size map was measured and has no jump, it is an opinion: levels that differ from it cost `UNEXPECTED`
+more. That is next to nothing where the images tell levels apart, and decides where they do not: a half-size census
+sees twice as far, so that it is right on weak texture where the full-size one follows the noise.
+
+D1, bad-1 (percent) and EPE (pixels) of S2 over all pairs, full search and coarse to fine: KITTI 2015 4.65, 24.7, 1.165
+and 4.55, 24.5, 1.141; KITTI 2012 4.46, 14.9, 1.026 and 4.11, 14.5, 0.961; Middlebury 4.25, 8.2, 0.943 and 4.18, 8.3,
+0.901; ETH3D 1.81, 12.4, 0.556 and 1.22, 10.9, 0.493; satellite 14.3, 42.2, 1.996 and 14.3, 42.2, 1.973; rendered 8.80,
+12.2, 3.026 and 8.82, 12.2, 2.927. An opinion at jumps too, or of pixels that were filled, costs Middlebury 3 % of bad-1
+and more; two steps of cost instead of one change little.
 """
 
 from __future__ import annotations
@@ -10,19 +20,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.costs.rows import Levels
+from stereokit.costs.rows import Levels, Search
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES
 
-__all__ = ["SEARCHED_IN_FULL", "SEARCHES", "halved_levels", "restore_thin", "search_starts"]
+__all__ = ["SEARCHED_IN_FULL", "SEARCHES", "halved_levels", "plan_search", "restore_thin"]
 
 SEARCHES = ("auto", "full", "coarse-to-fine")
 """Values of the option `search`."""
-SEARCHED_IN_FULL = 128
-"""Levels up to which a full search takes less time."""
+SEARCHED_IN_FULL = LANES
+"""Levels up to which "auto" searches in full: fewer leave nothing to save."""
 
 _RADIUS = 4  # of the neighbourhood, half-size pixels
 _MARGIN = 6.0  # above and below what it holds, levels
+_SLACK = 0.5  # around the expected levels
+_FLAT = 0.5  # range of the coarse map in 3x3 pixels up to which something is expected, half-size pixels
 _CONFIRMING = 3  # neighbours that agree with a thin thing
 _STEP = 8  # starts are multiples of this: neighbours then mostly share theirs
 
@@ -64,46 +76,69 @@ def restore_thin(selected: NDArray[np.float32], cleaned: NDArray[np.float32]) ->
                 cleaned[y, x] = value
 
 
-def search_starts(coarse: NDArray[np.float32], levels: Levels, out: NDArray[np.int16]) -> None:
-    """Write the first level of each pixel's search.
+def plan_search(coarse: NDArray[np.float32], measured: NDArray[np.bool_], levels: Levels, search: Search) -> None:
+    """Write where each pixel searches, and what is expected there.
 
     Parameters
     ----------
     coarse : (ceil(H / 2), ceil(W / 2)) float32, half-size pixels, no NaN
         Filled map of half the size.
+    measured : (ceil(H / 2), ceil(W / 2)) bool
+        Its pixels that were measured.
     levels : Levels
-        Of the full size, more than `LANES`.
-    out : (H, W) int16
-        Levels above `levels.minimum`, 0 to ``levels.count - LANES``.
+        Of the full size, at least `LANES`.
+    search : Search, (H, W)
+        Is overwritten.
     """
-    kernel = np.ones((2 * _RADIUS + 1, 2 * _RADIUS + 1), np.uint8)
-    low, high = (np.asarray(extreme(coarse, kernel), np.float32) for extreme in (cv2.erode, cv2.dilate))
-    _place_searches(coarse, low, high, levels.minimum, levels.count, out)
+
+    def around(radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+        low, high = (np.asarray(extreme(coarse, kernel), np.float32) for extreme in (cv2.erode, cv2.dilate))
+        return low, high
+
+    _plan(coarse, measured, *around(_RADIUS), *around(1), levels.minimum, levels.count, search)
 
 
 @kernel
-def _place_searches(
-    own: NDArray[np.float32], low: NDArray[np.float32], high: NDArray[np.float32], minimum: int, count: int,
-    out: NDArray[np.int16],
+def _plan(
+    own: NDArray[np.float32], measured: NDArray[np.bool_], low: NDArray[np.float32], high: NDArray[np.float32],
+    low_3: NDArray[np.float32], high_3: NDArray[np.float32],
+    minimum: int, count: int, search: Search,
 ) -> None:  # fmt: skip
-    """Write the starts for the half-size map and its lowest and highest values around each pixel."""
-    height, width = out.shape
+    """Write the search for a half-size map and its lowest and highest values around each pixel.
+
+    They are those of all pixels that the search shall hold, and of 3x3.
+    """
+    starts, first, last = search
+    height, width = starts.shape
     searched = np.float32(LANES)
+    zero = np.float32(0)
+    top = np.float32(LANES - 1)
     margin = np.float32(_MARGIN)
+    slack = np.float32(_SLACK)
     step = np.float32(_STEP)
-    last = np.float32(count - LANES)
     for y in range(own.shape[0]):
         for x in range(own.shape[1]):
-            first = np.float32(2) * low[y, x] - np.float32(minimum) - margin
+            begin = np.float32(2) * low[y, x] - np.float32(minimum) - margin
             end = np.float32(2) * high[y, x] - np.float32(minimum) + margin + np.float32(2)  # a pixel is two levels
             middle = np.float32(2) * own[y, x] - np.float32(minimum) - searched * np.float32(0.5)
-            middle = min(max(middle, first), max(end - searched, first))
-            spare = searched - (end - first)
-            start = first - spare * np.float32(0.5) if spare >= np.float32(0) else middle
+            middle = min(max(middle, begin), max(end - searched, begin))
+            spare = searched - (end - begin)
+            start = begin - spare * np.float32(0.5) if spare >= zero else middle
             start = np.floor(start / step + np.float32(0.5)) * step
-            value = np.int16(min(max(start, np.float32(0)), last))
-            out[2 * y, 2 * x] = value
-            out[2 * y, min(2 * x + 1, width - 1)] = value
+            start = min(max(start, zero), np.float32(count - LANES))
+            is_expected = measured[y, x] and high_3[y, x] - low_3[y, x] <= np.float32(_FLAT)
+            lowest = np.floor(np.float32(2) * low_3[y, x] - slack - np.float32(minimum) - start)
+            highest = np.ceil(np.float32(2) * high_3[y, x] + np.float32(1) + slack - np.float32(minimum) - start)
+            right = min(2 * x + 1, width - 1)
+            starts[2 * y, 2 * x] = np.int16(start)
+            starts[2 * y, right] = np.int16(start)
+            first[2 * y, 2 * x] = np.uint8(min(max(lowest, zero), top) if is_expected else zero)
+            first[2 * y, right] = first[2 * y, 2 * x]
+            last[2 * y, 2 * x] = np.uint8(min(max(highest, zero), top) if is_expected else top)
+            last[2 * y, right] = last[2 * y, 2 * x]
         if 2 * y + 1 < height:
             for x in range(width):
-                out[2 * y + 1, x] = out[2 * y, x]
+                starts[2 * y + 1, x] = starts[2 * y, x]
+                first[2 * y + 1, x] = first[2 * y, x]
+                last[2 * y + 1, x] = last[2 * y, x]

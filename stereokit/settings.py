@@ -90,8 +90,8 @@ class MatchSettings:
         The result includes the right view's map.
     search : {"auto", "full", "coarse-to-fine"}
         Which levels a pixel tries: all, or `LANES` around the map of half the size (`stereokit.search`). "auto" goes
-        from coarse to fine where there are more than `SEARCHED_IN_FULL` levels, the method can, and its costs are
-        cheap: then it is faster, and on all data sets at least as accurate.
+        from coarse to fine at full size where there are more than `SEARCHED_IN_FULL` levels, the method can, and its
+        costs are cheap: then it is at least as accurate on all data sets.
 
     Raises
     ------
@@ -203,8 +203,9 @@ class MatchSettings:
     def coarse_to_fine(self) -> bool:
         """Whether a pixel tries only levels around the map of half the size."""
         if self.search == "auto":
-            gains = not self.cost.costly_to_recompute  # both sweeps of a narrow search compute the costs
-            return self._can_narrow and gains and self.matched_levels.count > SEARCHED_IN_FULL
+            # Costs are computed by both sweeps of a narrow search. Maps of less than the full size gain nothing.
+            gains = self.scale == 1 and not self.cost.costly_to_recompute
+            return self._can_narrow and gains and self.levels.count > SEARCHED_IN_FULL
         return self.search == "coarse-to-fine"
 
     @property

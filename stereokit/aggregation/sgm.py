@@ -30,7 +30,7 @@ from stereokit.aggregation.paths.narrow import (
 from stereokit.aggregation.paths.penalties import Penalties
 from stereokit.aggregation.paths.steps import PathBuffers
 from stereokit.aggregation.paths.visits import CHUNK, finish_part, first_visit, prepare_rows, start
-from stereokit.costs.rows import WORST, Cost, Levels
+from stereokit.costs.rows import UNEXPECTED, WORST, Cost, Levels, Search
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer, check_number
 from stereokit.kernels.jit import kernel
@@ -98,8 +98,8 @@ class Sgm:
         """Raise OptionError if the penalties do not go with a cost."""
         self.penalties(cost.cost_max, cost.unit)
 
-    def penalties(self, cost_max: int, unit: int) -> Penalties:
-        """Return P1 and P2 in steps of cost.
+    def penalties(self, cost_max: int, unit: int, unexpected: int = 0) -> Penalties:
+        """Return P1 and P2 in steps of cost; P2 leaves room in 8 bits for costs that are `unexpected` steps higher.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class Sgm:
             raise OptionError(f"p1 must be at most p2, got p1={p1:g} and p2={p2:g}")
         if cost_max + round(p2 * unit) > 255 and self.p2 is not None:
             raise OptionError(f"p2 must be at most {(255 - cost_max) / unit:.4g} with this cost, got {p2:g}")
-        high = min(round(p2 * unit), 255 - cost_max)
+        high = min(round(p2 * unit), 255 - cost_max - unexpected)
         low = min(round(p1 * unit), high)
         at_edge = (np.uint8(np.rint(step * self.edge_factor)) for step in (low, high))
         edge = np.int16(min(math.ceil(self.edge), 256))  # 256: no two grey levels are so far apart
@@ -121,7 +121,7 @@ class Sgm:
     def sweep(
         self, rows: list[Any], levels: Levels, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
         threads: int, out: SelectionOutput, total: NDArray[np.uint16] | None = None,
-        starts: NDArray[np.int16] | None = None,
+        search: Search | None = None,
     ) -> None:  # fmt: skip
         """Aggregate the rows of two producers and select.
 
@@ -143,11 +143,11 @@ class Sgm:
             Maps of the selection.
         total : (H, W, P) uint16 or None
             Volume for the sums over all paths, if they are wanted.
-        starts : (H, W) int16 or None
-            First level of each pixel's search, which takes `LANES` levels; None where all pixels try all levels.
+        search : Search or None
+            What each pixel tries; None where all pixels try all levels.
         """
-        if starts is not None:
-            self._narrow_sweep(rows, starts, cost, guide, workspace, threads, out)
+        if search is not None:
+            self._narrow_sweep(rows, search, cost, guide, workspace, threads, out)
             return
         height = guide.shape[0]
         key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.costly_to_recompute
@@ -170,7 +170,7 @@ class Sgm:
         _meet(first, last, height, threads)
 
     def _narrow_sweep(
-        self, rows: list[Any], starts: NDArray[np.int16], cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
+        self, rows: list[Any], search: Search, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
         threads: int, out: SelectionOutput,
     ) -> None:  # fmt: skip
         """Aggregate and select where each pixel has a search of its own."""
@@ -181,7 +181,10 @@ class Sgm:
         )
         edges = np.full(3 * LANES, 255, np.uint8)
         edges[LANES : 2 * LANES] = 0
-        workers = [NarrowBuffers(buffers, starts.ravel(), edges) for buffers in paths]
+        below, above = np.zeros((2, 2 * LANES), np.uint8)
+        below[:LANES] = above[LANES + 1 :] = UNEXPECTED
+        flat = Search(search.starts.ravel(), search.low.ravel(), search.high.ravel())
+        workers = [NarrowBuffers(buffers, flat, edges, below, above) for buffers in paths]
         if len(workers) == 1:
             start_narrow(workers[0])
             _last_narrow_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out)
@@ -200,7 +203,9 @@ class Sgm:
         self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace, margin: int = 0
     ) -> tuple[Penalties, NDArray[Any], list[PathBuffers]]:
         """Return the penalties, the volume of sums and the buffers of each sweep, with a margin around path costs."""
-        penalties = self.penalties(cost.cost_max, cost.unit)
+        unexpected = UNEXPECTED if margin else 0
+        cost_max = cost.cost_max + unexpected
+        penalties = self.penalties(cost.cost_max, cost.unit, unexpected)
         height, width = shape
         size = width * levels.padded
         diagonals = self.paths != 4
@@ -220,8 +225,8 @@ class Sgm:
                 diagonals=diagonals,
                 paths=self.paths,
                 width=width,
-                byte_costs=whole and self.paths == 4 and 4 * cost.cost_max + most <= 255,
-                byte_brackets=whole and (5 if diagonals else 3) * most + (cost.cost_max if recovers else 0) <= 255,
+                byte_costs=whole and self.paths == 4 and 4 * cost_max + most <= 255,
+                byte_brackets=whole and (5 if diagonals else 3) * most + (cost_max if recovers else 0) <= 255,
                 cost=workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
                 across=workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
                 chains=workspace.array(f"sgm.chains{k}", 4 * levels.padded + 2 * margin, np.uint8),

@@ -33,11 +33,13 @@ from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
 __all__ = [
+    "UNEXPECTED",
     "WORST",
     "CellMask",
     "Cost",
     "CostInput",
     "Levels",
+    "Search",
     "VolumeRows",
     "cell_mask",
     "cost_row",
@@ -64,6 +66,18 @@ class Levels:
     def padded(self) -> int:
         """`count` rounded up to a multiple of `LANES`."""
         return -(-self.count // LANES) * LANES
+
+
+UNEXPECTED = 1
+"""Steps of cost that a level costs more where another one is expected."""
+
+
+class Search(NamedTuple):
+    """What each pixel tries instead of all levels: the `LANES` from its start on; (H, W) or flat."""
+
+    starts: NDArray[np.int16]  # first level
+    low: NDArray[np.uint8]  # first expected level, counted from the start
+    high: NDArray[np.uint8]  # last expected level; those below and above cost `UNEXPECTED` more
 
 
 @dataclass(frozen=True)

@@ -116,11 +116,11 @@ MUTANTS = [
     ),
     Mutant(
         "four costs and a bracket in a byte that holds three", "aggregation.sgm",
-        "4 * cost.cost_max + most <= 255", "3 * cost.cost_max + most <= 255", _OVERFLOW, "bytes",
+        "4 * cost_max + most <= 255", "3 * cost_max + most <= 255", _OVERFLOW, "bytes",
     ),
     Mutant(
         "brackets and a path cost in a byte that holds the brackets", "aggregation.sgm",
-        "cost.cost_max if recovers else 0", "0", _OVERFLOW, "bytes",
+        "cost_max if recovers else 0", "0", _OVERFLOW, "bytes",
     ),
     # ------------------------------------------------------------------ costs
     Mutant(
@@ -234,6 +234,11 @@ MUTANTS = [
         "state[:] = none", "", _UNWRITTEN, "sum",
     ),
     # ------------------------------------------------------------------ narrow searches
+    Mutant(
+        "the last expected level costs more", "aggregation.sgm",
+        "below[:LANES] = above[LANES + 1 :] = UNEXPECTED", "below[:LANES] = above[LANES:] = UNEXPECTED",
+        _BORDER, "narrow",
+    ),
     Mutant(
         "levels out of line with the pixel before", "aggregation.paths.narrow",
         "bitwise_or(load(costs, place + shift), load(edges, LANES + shift))",

@@ -16,11 +16,11 @@ import stereokit
 from stereokit import Census, Matcher
 from stereokit.aggregation.sgm import Sgm
 from stereokit.cli import app
-from stereokit.costs.rows import CostInput, Levels, produce_volume
+from stereokit.costs.rows import UNEXPECTED, CostInput, Levels, Search, produce_volume
 from stereokit.errors import DeviceError, OptionError, UnknownNameError
 from stereokit.kernels.simd import LANES
 from stereokit.kernels.workspace import Workspace
-from stereokit.search import halved_levels, restore_thin, search_starts
+from stereokit.search import halved_levels, plan_search, restore_thin
 from stereokit.selection.wta import selection_output
 
 PAIR = Census("5x5")
@@ -34,8 +34,15 @@ def textured(height, width, shift, seed=0):
     return np.ascontiguousarray(wide[:, :width]), np.ascontiguousarray(wide[:, shift:])
 
 
-def narrow(left, right, starts, levels, paths=4, threads=1, bad=(None, None), border=0.5, p1=3.0, p2=17.0):
+def open_search(starts):
+    """Return a search in which all levels are expected."""
+    return Search(starts, np.zeros(starts.shape, np.uint8), np.full(starts.shape, LANES - 1, np.uint8))
+
+
+def narrow(left, right, search, levels, paths=4, threads=1, bad=(None, None), border=0.5, p1=3.0, p2=17.0):
     """Return disparity, cost, confidence and both candidates of a narrow search."""
+    search = search if isinstance(search, Search) else open_search(search)
+    starts = search.starts
     workspace = Workspace()
     pair = CostInput(left, right, *bad, levels, border, threads, None, starts)
     stage = Sgm(p1=p1, p2=p2, paths=paths, edge_factor=1.0)
@@ -43,7 +50,7 @@ def narrow(left, right, starts, levels, paths=4, threads=1, bad=(None, None), bo
     disparity, confidence = np.empty(shape, np.float32), np.empty(shape, np.float32)
     cost, candidates = np.empty(shape, np.uint16), np.empty((2, *shape), np.float32)
     out = selection_output(disparity, cost, confidence, LANES, levels.minimum, True, 0, candidates, starts)
-    stage.sweep(PAIR.prepare(pair, workspace, 2), levels, PAIR, left, workspace, threads, out, starts=starts)
+    stage.sweep(PAIR.prepare(pair, workspace, 2), levels, PAIR, left, workspace, threads, out, search=search)
     return disparity, cost, confidence, candidates
 
 
@@ -60,9 +67,14 @@ def volume_of(left, right, levels, border=0.5, bad=(None, None)):
     return volume
 
 
-def expected(left, right, starts, levels, paths, bad=(None, None), p1=3, p2=17):
-    """Return disparity, cost and the level of the best rival, by loops."""
+def expected(left, right, search, levels, paths, bad=(None, None), p1=3, p2=17):
+    """Return disparity and cost, by loops."""
+    search = search if isinstance(search, Search) else open_search(search)
+    starts = search.starts
     volume = volume_of(left, right, levels, bad=bad)
+    for y, x, k in np.ndindex(volume.shape):
+        if not search.low[y, x] <= k - starts[y, x] <= search.high[y, x]:
+            volume[y, x, k] += UNEXPECTED
     total = oracles.narrow_sgm(volume, starts, LANES, p1, p2, oracles.DIRECTIONS[paths])
     own = np.stack([[t[s : s + LANES] for t, s in zip(*row, strict=True)] for row in zip(total, starts, strict=True)])
     disparity, cost, _ = oracles.select(own, levels.minimum)
@@ -78,6 +90,19 @@ def test_narrow_paths_are_those_of_loops(random_pair, paths, height, width):
     starts = rng.choice([0, 1, 7, 8, 40, 86], (height, width)).astype(np.int16)  # less than, just, and beyond a search
     disparity, cost, *_ = narrow(left, right, starts, levels, paths)
     wanted, wanted_cost = expected(left, right, starts, levels, paths)
+    np.testing.assert_array_equal(cost, wanted_cost)
+    np.testing.assert_allclose(disparity, wanted, atol=1e-5)
+
+
+def test_unexpected_levels_cost_more(random_pair):
+    left, right = random_pair(6, 20, seed=3)
+    levels, rng = Levels(0, 130), np.random.default_rng(5)
+    ends = np.sort(rng.integers(0, LANES, (2, 6, 20)), axis=0).astype(np.uint8)
+    ends[:, 0] = [[0], [LANES - 1]]  # all of them
+    ends[:, 1], ends[:, 2] = 0, LANES - 1  # one level at either end
+    search = Search(rng.choice([0, 8, 66], (6, 20)).astype(np.int16), *ends)
+    disparity, cost, *_ = narrow(left, right, search, levels)
+    wanted, wanted_cost = expected(left, right, search, levels, 4)
     np.testing.assert_array_equal(cost, wanted_cost)
     np.testing.assert_allclose(disparity, wanted, atol=1e-5)
 
@@ -138,18 +163,27 @@ def test_largest_costs_and_penalties_do_not_overflow(paths):
     levels = Levels(0, 140)
     starts = (np.indices(left.shape)[1] % 3 * 30).astype(np.int16)
     p2 = 255.0 - PAIR.cost_max
-    disparity, cost, *_ = narrow(left, right, starts, levels, paths, p1=p2, p2=p2)
-    wanted, wanted_cost = expected(left, right, starts, levels, paths, p1=int(p2), p2=int(p2))
+    search = Search(starts, np.full(left.shape, 5, np.uint8), np.full(left.shape, 9, np.uint8))
+    disparity, cost, *_ = narrow(left, right, search, levels, paths, p1=p2, p2=p2)
+    most = int(p2) - UNEXPECTED  # what is left of 8 bits
+    wanted, wanted_cost = expected(left, right, search, levels, paths, p1=most, p2=most)
     np.testing.assert_array_equal(cost, wanted_cost)
     np.testing.assert_allclose(disparity, wanted, atol=1e-5)
+
+
+def planned(coarse, levels, height, width, measured=None):
+    """Return the search for a half-size map."""
+    search = Search(*(np.full((height, width), 77, dtype) for dtype in (np.int16, np.uint8, np.uint8)))
+    measured = np.ones(coarse.shape, bool) if measured is None else measured
+    plan_search(coarse.astype(np.float32), measured, levels, search)
+    return search
 
 
 def test_searches_hold_what_the_half_size_map_has_around_a_pixel():
     rng = np.random.default_rng(3)
     levels = Levels(-6, 200)
-    coarse = (rng.random((9, 14)) * 20 + 30).astype(np.float32)
-    starts = np.full((17, 28), -1, np.int16)
-    search_starts(coarse, levels, starts)
+    coarse = rng.random((9, 14)) * 20 + 30
+    starts = planned(coarse, levels, 17, 28).starts
     assert (starts >= 0).all() and (starts <= levels.count - LANES).all()
     for y, x in np.ndindex(starts.shape):
         around = coarse[max(y // 2 - 4, 0) : y // 2 + 5, max(x // 2 - 4, 0) : x // 2 + 5]
@@ -157,21 +191,35 @@ def test_searches_hold_what_the_half_size_map_has_around_a_pixel():
 
 
 def test_searches_keep_to_the_pixels_own_value_where_both_do_not_fit():
-    levels = Levels(0, 500)
-    coarse = np.full((6, 40), 20, np.float32)
+    coarse = np.full((6, 40), 20.0)
     coarse[:, 20:] = 200
-    starts = np.empty((12, 80), np.int16)
-    search_starts(coarse, levels, starts)
+    starts = planned(coarse, Levels(0, 500), 12, 80).starts
     own = 2 * np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)
     assert (starts <= own - 5).all() and (own + 6 < starts + LANES).all()
 
 
 @pytest.mark.parametrize("value", [-50, 0, 1000])
 def test_searches_stay_within_the_range(value):
-    levels = Levels(-4, 90)
-    starts = np.empty((5, 7), np.int16)
-    search_starts(np.full((3, 4), value, np.float32), levels, starts)
-    assert starts.min() >= 0 and starts.max() <= 90 - LANES
+    search = planned(np.full((3, 4), value, float), Levels(-4, 90), 5, 7)
+    assert search.starts.min() >= 0 and search.starts.max() <= 90 - LANES
+    assert (search.low <= search.high).all() and search.high.max() < LANES
+
+
+def test_flat_and_measured_pixels_expect_their_levels():
+    rng = np.random.default_rng(8)
+    levels, minimum = Levels(-6, 200), -6
+    coarse = 40 + 0.3 * rng.random((9, 14))
+    coarse[:, 9:] += 8  # a jump
+    measured = rng.random(coarse.shape) < 0.7
+    search = planned(coarse, levels, 17, 27, measured)
+    for y, x in np.ndindex(17, 27):
+        y2, x2 = y // 2, x // 2
+        around = coarse.astype(np.float32)[max(y2 - 1, 0) : y2 + 2, max(x2 - 1, 0) : x2 + 2]
+        wanted = 0, LANES - 1
+        if measured[y2, x2] and around.max() - around.min() <= 0.5:
+            first = minimum + search.starts[y, x]
+            wanted = np.floor(2 * around.min() - 0.5) - first, np.ceil(2 * around.max() + 1.5) - first
+        assert (search.low[y, x], search.high[y, x]) == wanted
 
 
 @pytest.mark.parametrize(("minimum", "count"), [(0, 128), (-3, 130), (5, 67), (-129, 129), (7, 1)])
@@ -261,7 +309,7 @@ def test_poles_in_front_of_a_far_wall_are_not_lost():
         return cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
     base = texture(width + wall)
-    for gap, side, share in ((20, 6, 0.9), (40, 6, 0.9), (80, 8, 0.85), (80, 12, 0.9)):
+    for gap, side, share in ((20, 6, 0.9), (40, 6, 0.9), (80, 8, 0.8), (80, 12, 0.9)):
         left, right = base[:, :width].copy(), base[:, wall:].copy()
         pole = np.zeros(left.shape, bool)
         for x in range(240, width - 40, 100):
@@ -276,19 +324,33 @@ def test_poles_in_front_of_a_far_wall_are_not_lost():
         assert shares[1] >= share * shares[0] > 0.5 * share, (gap, side, shares)
 
 
-def test_auto_searches_in_full_up_to_128_levels(random_pair):
-    left, right = random_pair(20, 200)
-    assert not Matcher("S2").settings.coarse_to_fine
-    assert Matcher("S2", max_disparity=129).settings.coarse_to_fine
-    assert not Matcher("S2", max_disparity=256, scale=0.5).settings.coarse_to_fine  # 128 levels at half size
+def test_auto_searches_in_full_up_to_64_levels():
+    assert not Matcher("S2", max_disparity=64).settings.coarse_to_fine
+    assert Matcher("S2", max_disparity=65).settings.coarse_to_fine
+    assert not Matcher("S2", max_disparity=512, scale=0.5).settings.coarse_to_fine
+    assert Matcher("S2", max_disparity=512, scale=0.5, search="coarse-to-fine").settings.coarse_to_fine
     assert not Matcher("S1", max_disparity=512).settings.coarse_to_fine
     assert not Matcher("S4", max_disparity=512).settings.coarse_to_fine
     assert Matcher("S4", max_disparity=512, search="coarse-to-fine").settings.coarse_to_fine
-    assert Matcher("S2", max_disparity=129).identity()["search"] == "coarse-to-fine"
-    assert Matcher("S2", max_disparity=128).identity()["search"] == "full"
-    full = Matcher("S2", max_disparity=64)(left, right).disparity
-    narrow_map = Matcher("S2", max_disparity=64, search="coarse-to-fine")(left, right).disparity
-    np.testing.assert_array_equal(full, narrow_map)  # no range is narrower
+    assert Matcher("S2", max_disparity=65).identity()["search"] == "coarse-to-fine"
+    assert Matcher("S2", max_disparity=64).identity()["search"] == "full"
+
+
+def test_ranges_below_64_levels_are_searched_in_full(random_pair):
+    left, right = random_pair(20, 200)
+    full = Matcher("S2", max_disparity=63)(left, right).disparity
+    np.testing.assert_array_equal(full, Matcher("S2", max_disparity=63, search="coarse-to-fine")(left, right).disparity)
+
+
+def test_weak_texture_follows_the_half_size_map():
+    rng = np.random.default_rng(6)
+    left, right = textured(120, 300, 30)
+    left, right = (120 + image // 64 + rng.integers(0, 5, image.shape).astype(np.uint8) for image in (left, right))
+    errors = []
+    for search in ("full", "coarse-to-fine"):
+        disparity = stereokit.match(left, right, max_disparity=96, search=search)
+        errors.append((abs(disparity[:, 40:] - 30) > 1).mean())
+    assert errors[1] < 0.75 * errors[0] < 0.2
 
 
 def test_memory_does_not_grow_with_the_range():

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stereokit.aggregation.paths.penalties import Penalties, write_penalties
 from stereokit.aggregation.paths.steps import PathBuffers, bracket_of, slots_of
 from stereokit.aggregation.paths.visits import CHUNK, add_others, sum_of_sweep
-from stereokit.costs.rows import cost_row
+from stereokit.costs.rows import Search, cost_row
 from stereokit.kernels.jit import inline, kernel
 from stereokit.kernels.simd import (
     LANES,
@@ -44,8 +44,10 @@ class NarrowBuffers(NamedTuple):
     """Buffers of one worker."""
 
     paths: PathBuffers
-    starts: NDArray[np.int16]  # (H * W): first level of each pixel's search
+    search: Search
     edges: NDArray[np.uint8]  # 64 times 255, 64 times 0, 64 times 255
+    below: NDArray[np.uint8]  # 64 times `UNEXPECTED`, 64 times 0
+    above: NDArray[np.uint8]  # 65 times 0, 63 times `UNEXPECTED`
 
 
 @kernel
@@ -74,7 +76,7 @@ def _step(buffers: NarrowBuffers, costs: NDArray[np.uint8], place: int, shift: i
 @inline
 def _shift(buffers: NarrowBuffers, here: int, before: int) -> int:
     """Return by how many levels the search at pixel `here` begins above that at pixel `before`."""
-    shift: int = np.int64(buffers.starts[here]) - np.int64(buffers.starts[before])
+    shift: int = np.int64(buffers.search.starts[here]) - np.int64(buffers.search.starts[before])
     return shift
 
 
@@ -145,6 +147,19 @@ def _row_before(buffers: NarrowBuffers, guide: NDArray[np.uint8], y: int, step: 
     return before * buffers.paths.width
 
 
+@inline
+def _narrow_costs(rows: Any, buffers: NarrowBuffers, y: int, to: int) -> None:
+    """Write the costs of row `y`, those of unexpected levels raised, to element `to` of the buffers."""
+    width = buffers.paths.width
+    costs = buffers.paths.cost
+    cost_row(rows, y, costs[to : to + width * LANES])
+    for x in range(width):
+        low = np.int64(buffers.search.low[y * width + x])
+        high = np.int64(buffers.search.high[y * width + x])
+        unexpected = add(load(buffers.below, LANES - low), load(buffers.above, LANES - high))
+        store(costs, to + x * LANES, add(load(costs, to + x * LANES), unexpected))
+
+
 @kernel
 def first_narrow_visit(
     rows: Any, buffers: NarrowBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int,
@@ -160,7 +175,7 @@ def first_narrow_visit(
         y = y0 + k * step
         here = y * width
         before = here if k == 0 else here - step * width
-        cost_row(rows, y, buffers.paths.cost)
+        _narrow_costs(rows, buffers, y, 0)
         write_penalties(guide, y, step, buffers.paths.diagonals, False, penalties, 0, buffers.paths.penalties)
         bypass = (abs(y1 - y0) - k) * width * LANES > near
         for x in range(width):
@@ -235,7 +250,7 @@ def prepare_narrow_rows(
     paths = buffers.paths
     size = paths.width * LANES
     for n in range(count):
-        cost_row(rows, y + n * step, paths.cost[n * size : (n + 1) * size])
+        _narrow_costs(rows, buffers, y + n * step, n * size)
         place = 8 * n * paths.width
         write_penalties(guide, y + n * step, step, paths.diagonals, True, penalties, place, paths.penalties)
     _horizontals(buffers, y * paths.width, (y + step) * paths.width, count)

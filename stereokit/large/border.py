@@ -20,6 +20,9 @@ from stereokit.large.sources import Source
 
 __all__ = ["BlackBorder", "find_border"]
 
+_LABEL_NBYTES = 32
+"""Memory that labels take, bytes per pixel."""
+
 
 @dataclass(frozen=True, eq=False)
 class BlackBorder:
@@ -56,20 +59,21 @@ def find_border(source: Source, nbytes: int) -> BlackBorder | None:
     ----------
     source : Source
     nbytes : int
-        Approximate size of the blocks that are read, bytes.
+        Approximate memory of the blocks that are read, with their labels, bytes.
     """
     height, width = source.shape[:2]
     sides = ((0, 1, 0, width), (height - 1, height, 0, width), (0, height, 0, 1), (0, height, width - 1, width))
     if not any(_black(source, *side).any() for side in sides):
         return None
-    row_nbytes = width * source.dtype.itemsize * (source.shape[2] if len(source.shape) == 3 else 1)
+    channels = source.shape[2] if len(source.shape) == 3 else 1
+    row_nbytes = width * max(source.dtype.itemsize * channels, _LABEL_NBYTES)
     rows = max(1, nbytes // max(row_nbytes, 1) // source.row_step) * source.row_step
     border = _components(source, rows)
     if border is None:
         return None
     counts, runs = [np.zeros(1, np.int64)], []
     for labels, offset in _labelled(source, rows):
-        is_border = border[labels + np.where(labels > 0, offset, 0)]
+        is_border = border[_unique(labels, offset)]
         change = np.diff(is_border.astype(np.int8), axis=1, prepend=0, append=0)
         y, start = np.nonzero(change == 1)
         runs.append(np.column_stack([start, np.nonzero(change == -1)[1]]).astype(np.int32))
@@ -85,14 +89,27 @@ def _black(source: Source, y0: int, y1: int, x0: int, x1: int) -> NDArray[np.boo
 
 
 def _labelled(source: Source, rows: int) -> Iterator[tuple[NDArray[np.int32], int]]:
-    """Yield the labels of each block of rows, 0 where a pixel is not black, and what to add to make them unique."""
+    """Yield the labels of each block of rows, and what to add to them, unless they are 0, to make them unique.
+
+    Black pixels that reach no side of their block belong to no border and are 0, as pixels are that are not black: an
+    image may have a million of them.
+    """
     height, width = source.shape[:2]
     offset = 0
     for top in range(0, height, rows):
         zero = _black(source, top, min(top + rows, height), 0, width)
         count, labels = cv2.connectedComponents(zero.view(np.uint8), connectivity=4)
-        yield np.asarray(labels, np.int32), offset
-        offset += count - 1
+        kept = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+        kept = kept[kept > 0]
+        number = np.zeros(count, np.int32)
+        number[kept] = np.arange(1, len(kept) + 1)
+        yield number[labels], offset
+        offset += len(kept)
+
+
+def _unique(labels: NDArray[np.int32], offset: int) -> NDArray[np.int64]:
+    """Return the unique numbers of a block's labels."""
+    return np.where(labels > 0, labels + np.int64(offset), 0)
 
 
 def _components(source: Source, rows: int) -> NDArray[np.bool_] | None:
@@ -111,7 +128,7 @@ def _components(source: Source, rows: int) -> NDArray[np.bool_] | None:
     top = 0
     for labels, offset in _labelled(source, rows):
         bottom = top + len(labels)
-        unique = labels + np.where(labels > 0, offset, 0)
+        first, final = _unique(labels[[0, -1]], offset)
         count = int(labels.max())
         parents += range(offset + 1, offset + count + 1)
         halo = max(top - 1, 0), min(bottom + 1, height)
@@ -125,10 +142,10 @@ def _components(source: Source, rows: int) -> NDArray[np.bool_] | None:
         numbers = [np.bincount(labels[where], minlength=count + 1)[1:] for where in (labels > 0, thick > 0, at_side)]
         area, inner, sides = (np.append(old, new) for old, new in zip((area, inner, sides), numbers, strict=True))
         if last is not None:
-            both = (last > 0) & (unique[0] > 0)
-            for above, below in np.unique(np.column_stack([last, unique[0]])[both], axis=0):
+            both = (last > 0) & (first > 0)
+            for above, below in np.unique(np.column_stack([last, first])[both], axis=0):
                 parents[root(int(below))] = root(int(above))
-        last, top = unique[-1], bottom
+        last, top = final, bottom
     roots = np.array([root(label) for label in range(len(parents))])
     area, inner, sides = (
         np.bincount(roots, numbers, minlength=len(roots)).astype(np.int64) for numbers in (area, inner, sides)

@@ -175,10 +175,10 @@ class CpuPipeline:
     def _search(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Search | None:
         """Return what each pixel tries; None where every pixel tries all levels."""
         is_matched_size = levels == self.settings.matched_levels
-        if not self.settings.coarse_to_fine or levels.count < LANES + (0 if is_matched_size else 1):
+        if not self.settings.coarse_to_fine or not (is_matched_size or levels.count > LANES):
             return None
         with span("prepare", "half size"):
-            half = half_size(pair)
+            half = half_size(pair, tolerant=True)
         coarse = self._map(half, halved_levels(levels), None, workspace.part("half"), threads)
         with span("prepare", "search ranges"):
             shape = pair.left.shape

@@ -14,6 +14,7 @@ from stereokit.costs.rows import Cost, Levels
 from stereokit.defaults import defaults_of
 from stereokit.errors import OptionError, UnknownNameError, did_you_mean, shown
 from stereokit.images.check import check_flag, check_integer, check_names, check_nodata, check_number
+from stereokit.kernels.simd import LANES
 from stereokit.methods import check_levels, current_names, find_refiner, option_names, parse_method
 from stereokit.options import opencv_hint
 from stereokit.postprocess.chain import PostProcessing
@@ -206,7 +207,7 @@ class MatchSettings:
             # Costs are computed by both sweeps of a narrow search. Maps of less than the full size gain nothing.
             gains = self.scale == 1 and not self.cost.costly_to_recompute
             return self._can_narrow and gains and self.levels.count > SEARCHED_IN_FULL
-        return self.search == "coarse-to-fine"
+        return self.search == "coarse-to-fine" and self.matched_levels.count >= LANES
 
     @property
     def step(self) -> int:

@@ -65,10 +65,17 @@ def reduced(pair: GrayPair, step: int) -> GrayPair:
     return pair
 
 
-def half_size(pair: GrayPair) -> GrayPair:
+def half_size(pair: GrayPair, *, tolerant: bool = False) -> GrayPair:
     """Return the pair at half size, ``(ceil(H/2), ceil(W/2))``: the mean of each 2x2 pixels.
 
     Odd sizes are extended by their last row or column. A pixel is bad if one of its four is.
+
+    Parameters
+    ----------
+    pair : GrayPair
+    tolerant : bool
+        A pixel is bad only if all of its four are: where a fifth of the pixels are bad here and there, half of those of
+        the half size would be, and nearly all of the quarter.
     """
 
     def shrink(image: NDArray[Any]) -> NDArray[Any]:
@@ -84,8 +91,8 @@ def half_size(pair: GrayPair) -> GrayPair:
         left=left,
         right=right,
         guide=guide,
-        left_bad=_half_mask(pair.left_bad),
-        right_bad=_half_mask(pair.right_bad),
+        left_bad=_half_mask(pair.left_bad, whole=tolerant),
+        right_bad=_half_mask(pair.right_bad, whole=tolerant),
         left_blank=_half_mask(pair.left_blank),
     )
 
@@ -97,9 +104,11 @@ def reduced_mask(mask: NDArray[np.bool_] | None, step: int) -> NDArray[np.bool_]
     return mask
 
 
-def _half_mask(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+def _half_mask(mask: NDArray[np.bool_] | None, *, whole: bool = False) -> NDArray[np.bool_] | None:
+    """Return where one of 2x2 pixels is True or, `whole`, all are."""
     if mask is None:
         return None
     height, width = mask.shape
-    even = np.pad(mask, ((0, height % 2), (0, width % 2)))
-    return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).any(axis=(1, 3)))
+    even = np.pad(mask, ((0, height % 2), (0, width % 2)), mode="edge")
+    fours = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2)
+    return np.asarray(fours.all(axis=(1, 3)) if whole else fours.any(axis=(1, 3)))

@@ -18,6 +18,8 @@ from stereokit.aggregation.sgm import Sgm
 from stereokit.cli import app
 from stereokit.costs.rows import UNEXPECTED, CostInput, Levels, Search, produce_volume
 from stereokit.errors import DeviceError, OptionError, UnknownNameError
+from stereokit.images.gray import GrayPair
+from stereokit.images.resize import half_size
 from stereokit.kernels.simd import LANES
 from stereokit.kernels.workspace import Workspace
 from stereokit.search import halved_levels, plan_search, restore_thin
@@ -300,6 +302,31 @@ def test_images_of_all_kinds(kind):
         assert np.isnan(result.disparity[:, 200:210]).all()
 
 
+def test_many_bad_pixels_do_not_blind_the_half_size_map():
+    """One pixel in four is bad: so are two thirds of the 2x2, and nearly all of the 4x4."""
+    left, right = textured(120, 400, 140)
+    usable = np.random.default_rng(2).random((2, *left.shape)) > 0.25
+    shares = []
+    for search in ("full", "coarse-to-fine"):
+        result = Matcher("S2", max_disparity=256, search=search)(left, right, mask=usable[0], right_mask=usable[1])
+        found = abs(result.disparity[:, 148:][usable[0][:, 148:]] - 140) < 1
+        shares.append(found.mean())
+    assert shares[0] > 0.9 and shares[1] > 0.98 * shares[0], shares
+
+
+@pytest.mark.parametrize("shape", [(4, 6), (5, 7), (1, 1), (1, 4), (3, 1)])
+def test_half_size_pixels_are_bad_if_one_is_or_all_are(shape):
+    rng = np.random.default_rng(shape[0])
+    image, bad = rng.integers(0, 256, shape, np.uint8), rng.random(shape) < 0.6
+    pair = GrayPair(image, image, bad, ~bad, image)
+    for tolerant, rule in ((False, any), (True, all)):
+        half = half_size(pair, tolerant=tolerant)
+        for mine, whole in ((half.left_bad, bad), (half.right_bad, ~bad)):
+            assert mine.shape == half.left.shape
+            for y, x in np.ndindex(mine.shape):
+                assert mine[y, x] == rule(whole[2 * y : 2 * y + 2, 2 * x : 2 * x + 2].ravel())
+
+
 def test_poles_in_front_of_a_far_wall_are_not_lost():
     rng = np.random.default_rng(1)
     height, width, wall = 120, 640, 20
@@ -338,8 +365,12 @@ def test_auto_searches_in_full_up_to_64_levels():
 
 def test_ranges_below_64_levels_are_searched_in_full(random_pair):
     left, right = random_pair(20, 200)
-    full = Matcher("S2", max_disparity=63)(left, right).disparity
-    np.testing.assert_array_equal(full, Matcher("S2", max_disparity=63, search="coarse-to-fine")(left, right).disparity)
+    full, matcher = Matcher("S2", max_disparity=63), Matcher("S2", max_disparity=63, search="coarse-to-fine")
+    np.testing.assert_array_equal(full(left, right).disparity, matcher(left, right).disparity)
+    assert full.identity() == matcher.identity()
+    half = Matcher("S2", max_disparity=126, search="coarse-to-fine", scale=0.5)
+    assert half.identity()["search"] == "full"
+    assert half.replaced(scale=1.0, refiner=None, refiner_name=None).identity()["search"] == "coarse-to-fine"
 
 
 def test_weak_texture_follows_the_half_size_map():

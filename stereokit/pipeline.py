@@ -30,6 +30,8 @@ from stereokit.settings import Detail, MatchSettings
 
 __all__ = ["CpuPipeline", "Pipeline", "concluded", "refined", "with_blank"]
 
+_HALF_SIZE_MEDIAN = 5
+"""Side of the median of maps that tell where to search, whatever `median` is: that of `match_large`'s windows is 0."""
 _PROBES = (256, 512)
 """Sides of the images that are matched to measure the growth of the buffers, pixels."""
 
@@ -237,7 +239,7 @@ class CpuPipeline:
         with span("clean", "post-processing"):
             chain = settings.post_processing(disparity.size)
             if detail is None:
-                chain = replace(chain, fill="nearest", empty_value=levels.minimum)
+                chain = replace(chain, fill="nearest", median=_HALF_SIZE_MEDIAN, empty_value=levels.minimum)
             bad = pair.left_bad if detail is not None else None
             disparity, valid = post_process(disparity, total, bad, chain, workspace, threads)
             if selected is not None:

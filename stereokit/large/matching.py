@@ -45,19 +45,22 @@ length, the larger of the two data sets; by the overlap::
 
                      32            64            96            128           192
     rows     S1   0.1  0.03     0.0  0.00     0.0  0.00     0.0  0.00     0.0  0.00
-             S2   8.5  0.54     1.1  0.09     0.4  0.01     0.2  0.01     0.0  0.00
+             S2    11  0.45     3.6  0.13     1.4  0.11     0.6  0.07     0.1  0.00
+       full, S2   7.5  0.25     2.0  0.08     0.6  0.01     0.2  0.00     0.0  0.00
              S3   0.0  0.01     0.0  0.00     0.0  0.00     0.0  0.00     0.0  0.00
              S4   3.4  0.10     0.2  0.00     0.1  0.00     0.0  0.00     0.0  0.00
        half, S4    19  0.69     3.4  0.07     1.6  0.18     0.6  0.17     0.0  0.00
     columns  S1   0.1  0.00     0.0  0.00     0.0  0.00     0.0  0.00     0.0  0.00
-             S2    12  2.7      7.7  0.98     6.5  0.84     5.2  0.85     3.1  0.40
+             S2    51  9.9       44   11       36  7.8       25  5.6       11  3.6
+       full, S2    26  4.5       17  3.1       12  3.3      6.0  0.35     2.5  0.10
              S3   1.3  0.10     0.7  0.05     0.6  0.02     0.5  0.01     0.4  0.01
              S4   7.1  1.5      5.0  0.89     2.8  0.51     1.7  0.45     1.0  0.19
        half, S4    21  3.7       15  2.6       11  1.7      9.2  1.4      3.1  0.20
 
 Rows are the better place to cut; columns are cut where that saves work. Strips of 500 rows with a margin of 96 have,
-at full size, less than a pixel in ten thousand that is off by more than a pixel. Large surfaces without texture, where
-only what comes from afar decides, have more.
+at full size, less than a pixel in ten thousand that is off by more than a pixel, and S2 four, whose half-size map, from
+coarse to fine, sees twice as far. Each further halving, of larger ranges, doubles that again. Large surfaces without
+texture, where only what comes from afar decides, have more.
 """
 
 _RESERVE_NBYTES = 6 * BLOCK_NBYTES + 2**24

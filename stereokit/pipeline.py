@@ -174,13 +174,18 @@ class CpuPipeline:
                 pair = reduced(pair, settings.step)
         return self._map(pair, settings.matched_levels, settings.detail, workspace, threads)
 
-    def _search(self, pair: GrayPair, levels: Levels, workspace: Workspace, threads: int) -> Search | None:
-        """Return what each pixel tries; None where every pixel tries all levels."""
+    def _search(
+        self, pair: GrayPair, smoothed: GrayPair, levels: Levels, workspace: Workspace, threads: int
+    ) -> Search | None:
+        """Return what each pixel of a pair tries; None where every pixel tries all levels."""
         is_matched_size = levels == self.settings.matched_levels
         if not self.settings.coarse_to_fine or not (is_matched_size or levels.count > LANES):
             return None
         with span("prepare", "half size"):
             half = half_size(pair, tolerant=True)
+            if pair.ranges is None and getattr(self.settings.cost, "needs_ranges", False):
+                left, right = ((int(view.min()), int(view.max())) for view in (smoothed.left, smoothed.right))
+                half = replace(half, ranges=(left, right))  # all sizes have one range, as in windows of larger images
         coarse = self._map(half, halved_levels(levels), None, workspace.part("half"), threads)
         with span("prepare", "search ranges"):
             shape = pair.left.shape
@@ -198,11 +203,12 @@ class CpuPipeline:
         """Return the map of a pair at its own size; without a `detail`, filled and for the search of the next size."""
         settings = self.settings
         cost, aggregation = settings.cost, settings.aggregation
-        search = self._search(pair, levels, workspace, threads)
-        starts = None if search is None else search.starts
         guide = pair.guide
         with span("prepare", "smooth"):
-            pair = smooth(pair, settings.smooth, workspace, threads, eight_bits=takes_8_bits(cost))
+            smoothed = smooth(pair, settings.smooth, workspace, threads, eight_bits=takes_8_bits(cost))
+        search = self._search(pair, smoothed, levels, workspace, threads)
+        starts = None if search is None else search.starts
+        pair = smoothed
         shape = pair.left.shape
         with span("prepare", "prepare cost"):
             rows = cost.prepare(

@@ -179,18 +179,21 @@ def test_half_size_keeps_its_phase(tmp_path, cut):
     assert far == 0 and differ < 0.001
 
 
-@pytest.mark.parametrize("options", [{}, {"median": 0}, {"median": 3, "fill": None}])
-def test_windows_search_where_the_whole_image_does(options, tmp_path, cut):
-    """Windows are matched without median and fill: their half-size maps have both."""
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [("S2", {}), ("S2", {"median": 0}), ("S2", {"median": 3, "fill": None}), ("S4", {}), ("S4", {"smooth": 0})],
+)
+def test_windows_search_where_the_whole_image_does(method, options, tmp_path, cut):
+    """Windows are matched without median and fill: their half-size maps have both, and the range of the image."""
     left, right = textured(481, 403)
     tiles = np.random.default_rng(4).integers(0, 60, (17, 15))
     shifts = np.kron(tiles, np.ones((29, 27), int))[:481, :403]  # steps everywhere, and what is hidden behind them
     right = np.take_along_axis(right, np.clip(np.arange(403) + shifts, 0, 402), axis=1)
     cut(320 * 403)
     options = {"search": "coarse-to-fine", "max_disparity": 128, **options}
-    result = stereokit.match_large(left, right, tmp_path / "out.npy", "S2", overlap=96, **options)
+    result = stereokit.match_large(left, right, tmp_path / "out.npy", method, overlap=96, **options)
     assert result.windows > 1 and result.window[1] == 403
-    expected = stereokit.Matcher("S2", **options)(left, right).disparity
+    expected = stereokit.Matcher(method, **options)(left, right).disparity
     windows = np.load(tmp_path / "out.npy")
     same = (windows == expected) | (np.isnan(windows) & np.isnan(expected))
     assert same.mean() > 0.995

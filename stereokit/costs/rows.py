@@ -125,6 +125,8 @@ class Cost(Protocol):
       `stereokit.DeviceError` for options that the twin does not take. Without one, methods run on the CPU only;
     - ``needs_ranges``: its costs depend on the smallest and largest values of the whole images (`CostInput.ranges`),
       which `stereokit.match_large` then looks for first;
+    - ``narrow``: `prepare` honours `CostInput.starts`: its producers then write ``(W, LANES)`` costs a row. Without it,
+      every pixel tries all levels;
     - ``bytes_per_pixel``: memory that it takes beside its buffers.
     """
 

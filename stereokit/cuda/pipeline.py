@@ -124,16 +124,18 @@ class CudaPipeline:
     ----------
     settings : MatchSettings
         Options. Costs and aggregations name the modules of their CUDA twins; a refiner with ``on_device`` serves
-        `match_on_device`.
+        `match_on_device`. A pixel tries all levels, also where ``search`` is "auto".
 
     Raises
     ------
     DeviceError
-        If a stage has no CUDA kernels.
+        If a stage has no CUDA kernels, or the search shall go from coarse to fine.
     """
 
     def __init__(self, settings: MatchSettings) -> None:
-        self.settings = settings
+        if settings.search == "coarse-to-fine":
+            raise DeviceError("search must be 'full' or 'auto' with device 'cuda', got 'coarse-to-fine'")
+        self.settings = settings.replaced(search="full")
         self._cost = _twin("cost", settings.cost)
         self._aggregation = _twin("aggregation", settings.aggregation)
         if hasattr(self._cost, "check"):

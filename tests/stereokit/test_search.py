@@ -399,13 +399,16 @@ def test_what_cannot_search_so_says_so():
         Matcher("S2", search=None)
 
 
-def test_the_gpu_searches_in_full(monkeypatch):
+def test_the_gpu_searches_in_full():
     from stereokit import matching
 
     settings = Matcher("S2", max_disparity=256).settings
     assert matching._pipeline(settings, "cuda").settings.search == "full"
     with pytest.raises(DeviceError, match="search must be 'full' or 'auto' with device 'cuda', got 'coarse-to-fine'"):
         matching._pipeline(settings.replaced(search="coarse-to-fine"), "cuda")
+    with pytest.raises(DeviceError, match="coarse-to-fine"):
+        matching._pipeline(settings, "cuda").replaced(search="coarse-to-fine")
+    assert matching._pipeline(settings, "cuda").replaced(search="auto").settings.identity()["search"] == "full"
 
 
 def test_the_command_line_takes_it(tmp_path):

@@ -5,6 +5,8 @@ scenes of Middlebury, with one set of options for both. They are chosen by the t
 "validation" are whole other drives, which the search did not choose by. OpenCV's StereoSGBM with eight directions
 (MODE_HH, padded) has 8.21 on all frames, and 4.26, 7.28 and 4.69 on the scenes.
 
+All of it with a full search; `stereokit.search` has the errors of both.
+
 D1 noc, percent, pooled over the tuning frames, and in brackets the mean of bad-2.0 nonocc, percent, over cones, teddy
 and Motorcycle (``python -m stereokit_evaluation.commands.search --data DIR --output search.csv``)::
 

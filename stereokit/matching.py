@@ -58,8 +58,8 @@ class Matcher:
         `stereokit_refiners.Refiner`); None is ``"linear"``, and no refiner at full size. Learned ones are
         faster with ``stereokit[refiners]``; those other than ``"stereokit"`` and ``"auto"`` need ``scale=0.5``.
     device : {"auto", "cpu", "cuda"}
-        Where to compute; the map is that of the CPU with ``search="full"``. "cuda" needs an NVIDIA GPU and
-        ``stereokit[cuda]``. "auto" is the CPU for now, with a GPU too: the kernels are tested in an interpreter and
+        Where to compute; with one `search` the map is the same. "cuda" needs an NVIDIA GPU and ``stereokit[cuda]``,
+        and searches in full. "auto" is the CPU for now, with a GPU too: the kernels are tested in an interpreter and
         have not run on a GPU yet. Refiners run on the CPU, but for `on_device`.
     threads : int or None
         Threads of one call; None uses the processors at hand. The result does not depend on it.

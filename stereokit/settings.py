@@ -91,8 +91,8 @@ class MatchSettings:
         The result includes the right view's map.
     search : {"auto", "full", "coarse-to-fine"}
         Which levels a pixel tries: all, or `LANES` around the map of half the size (`stereokit.search`). "auto" goes
-        from coarse to fine at full size where there are more than `SEARCHED_IN_FULL` levels, the method can, and its
-        costs are cheap: then it is at least as accurate on all data sets.
+        from coarse to fine at full size where there are more than `SEARCHED_IN_FULL` levels (with a refiner, as many),
+        the method can, and its costs are cheap: then it is at least as accurate on all data sets.
 
     Raises
     ------
@@ -204,9 +204,11 @@ class MatchSettings:
     def coarse_to_fine(self) -> bool:
         """Whether a pixel tries only levels around the map of half the size."""
         if self.search == "auto":
-            # Costs are computed by both sweeps of a narrow search. Maps of less than the full size gain nothing.
+            # Costs are computed by both sweeps of a narrow search. Maps of less than the full size gain nothing, and 64
+            # levels gain no time: there it is for those who ask for accuracy, by a refiner at full size.
             gains = self.scale == 1 and not self.cost.costly_to_recompute
-            return self._can_narrow and gains and self.levels.count > SEARCHED_IN_FULL
+            in_full = SEARCHED_IN_FULL if self.refiner is None else SEARCHED_IN_FULL - 1
+            return self._can_narrow and gains and self.levels.count > in_full
         return self.search == "coarse-to-fine" and self.matched_levels.count >= LANES
 
     @property

@@ -6,8 +6,8 @@ selects as it goes, so that no volume need be stored (`stereokit.aggregation.sgm
 
 - ``fitting(cost, defaults)``, a class method: changes to default options that a cost calls for;
 - ``check_cost(cost)``: raises `stereokit.OptionError` where options do not go with a cost;
-- ``narrow``: `sweep` takes a further argument ``search``, a `stereokit.costs.rows.Search` or None, which says what each
-  pixel tries (`stereokit.search`). Without it, every pixel tries all levels;
+- ``narrow``: True where `sweep` takes a further argument ``search``, a `stereokit.costs.rows.Search` that says what
+  each pixel tries instead of all levels (the rows then have ``LANES`` levels);
 - ``cuda``: the name of the module with its CUDA twin, whose ``aggregate`` has the arguments of
   `stereokit.aggregation.sgm_cuda.aggregate`. Without one the method runs on the CPU only.
 """

@@ -222,7 +222,7 @@ class Sgm:
         workers = [
             PathBuffers(
                 blocks=tuple(range(levels.padded // LANES)),
-                diagonals=diagonals,
+                diagonals=(0,) if diagonals else (),
                 paths=self.paths,
                 width=width,
                 byte_costs=whole and self.paths == 4 and 4 * cost_max + most <= 255,

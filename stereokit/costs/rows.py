@@ -123,10 +123,9 @@ class Cost(Protocol):
     - ``cuda``: the name of the module with its CUDA twin, whose ``volume(queue, cost, pair)`` returns the volume of
       costs on the device as `stereokit.costs.rows_cuda` has it, and whose ``check(cost)``, if it has one, raises
       `stereokit.DeviceError` for options that the twin does not take. Without one, methods run on the CPU only;
+    - ``narrow``: True where `prepare` makes rows of `LANES` levels from `CostInput.starts` on, if those are given;
     - ``needs_ranges``: its costs depend on the smallest and largest values of the whole images (`CostInput.ranges`),
       which `stereokit.match_large` then looks for first;
-    - ``narrow``: `prepare` honours `CostInput.starts`: its producers then write ``(W, LANES)`` costs a row. Without it,
-      every pixel tries all levels;
     - ``bytes_per_pixel``: memory that it takes beside its buffers.
     """
 

@@ -354,6 +354,8 @@ def test_poles_in_front_of_a_far_wall_are_not_lost():
 def test_auto_searches_in_full_up_to_64_levels():
     assert not Matcher("S2", max_disparity=64).settings.coarse_to_fine
     assert Matcher("S2", max_disparity=65).settings.coarse_to_fine
+    assert Matcher("S2", max_disparity=64, refiner="auto").settings.coarse_to_fine  # for accuracy
+    assert not Matcher("S2", max_disparity=63, refiner="auto").settings.coarse_to_fine
     assert not Matcher("S2", max_disparity=512, scale=0.5).settings.coarse_to_fine
     assert Matcher("S2", max_disparity=512, scale=0.5, search="coarse-to-fine").settings.coarse_to_fine
     assert not Matcher("S1", max_disparity=512).settings.coarse_to_fine

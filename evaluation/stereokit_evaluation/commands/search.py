@@ -7,6 +7,7 @@ Options are chosen by the tuning column and the three scenes; validation is prin
 
 `DIR` has ``kitti2015`` and ``middlebury/{2003/cones, 2003/teddy, 2014/Motorcycle}``. Rows are appended to the CSV one
 by one; options that are in it are not run again. ``--scale 0.5`` searches the defaults of half size.
+Disparities are searched in full.
 """
 
 from __future__ import annotations
@@ -82,13 +83,13 @@ def _bad_2(frame: Frame, method: str, options: dict[str, Any]) -> float:
     left, right, truth = frame.load_left(), frame.load_right(), frame.load_noc()
     assert truth is not None
     levels = 64 if frame.max_disparity is None else frame.max_disparity
-    disparity = Matcher(method, max_disparity=levels, **options)(left, right).disparity
+    disparity = Matcher(method, max_disparity=levels, search="full", **options)(left, right).disparity
     known = np.isfinite(truth)
     return float(100 * np.mean(np.abs(disparity - truth)[known] > 2))
 
 
 def _row(method: str, options: dict[str, Any], kitti: list[Frame], scenes: dict[str, Frame]) -> dict[str, Any]:
-    matcher = Matcher(method, **options)
+    matcher = Matcher(method, search="full", **options)
     tuning, validation = (_d1(select_frames(kitti, part), matcher) for part in (TUNING, VALIDATION))
     parts = (tuning, validation, (tuning[0] + validation[0], tuning[1] + validation[1]))
     shares = [f"{100 * errors / pixels:.2f}" for errors, pixels in parts]

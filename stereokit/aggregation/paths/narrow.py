@@ -115,7 +115,7 @@ def _from_row_before(
     brackets = convert(bracket, like)
     from_left = straight
     from_right = straight
-    if paths.diagonals:
+    if len(paths.diagonals) > 0:
         shift_left = 0
         shift_right = 0
         if x == 0:
@@ -132,7 +132,7 @@ def _from_row_before(
         brackets = add(brackets, convert(bracket, like))
     low_left, low, low_right, _ = lowest_of_4(from_left, straight, from_right, straight)
     _leave(buffers, slots.straight, straight, low)
-    if paths.diagonals:
+    if len(paths.diagonals) > 0:
         _leave(buffers, slots.from_left, from_left, low_left)
         _leave(buffers, slots.from_right, from_right, low_right)
     return brackets
@@ -176,7 +176,7 @@ def first_narrow_visit(
         here = y * width
         before = here if k == 0 else here - step * width
         _narrow_costs(rows, buffers, y, 0)
-        write_penalties(guide, y, step, buffers.paths.diagonals, False, penalties, 0, buffers.paths.penalties)
+        write_penalties(guide, y, step, len(buffers.paths.diagonals) > 0, False, penalties, 0, buffers.paths.penalties)
         bypass = (abs(y1 - y0) - k) * width * LANES > near
         for x in range(width):
             cost = load(buffers.paths.cost, x * LANES)
@@ -252,7 +252,7 @@ def prepare_narrow_rows(
     for n in range(count):
         _narrow_costs(rows, buffers, y + n * step, n * size)
         place = 8 * n * paths.width
-        write_penalties(guide, y + n * step, step, paths.diagonals, True, penalties, place, paths.penalties)
+        write_penalties(guide, y + n * step, step, len(paths.diagonals) > 0, True, penalties, place, paths.penalties)
     _horizontals(buffers, y * paths.width, (y + step) * paths.width, count)
 
 

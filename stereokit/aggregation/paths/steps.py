@@ -49,7 +49,7 @@ class PathBuffers(NamedTuple):
     """Buffers of one worker (flat arrays; see the package's picture)."""
 
     blocks: tuple[int, ...]  # one element per 64 levels: its length is known to the compiler
-    diagonals: bool
+    diagonals: tuple[int, ...]  # not empty where paths come from the left and the right of the row before, too
     paths: int
     width: int
     byte_costs: bool  # 4 paths, no level pads, and 4 costs and a bracket fit a byte
@@ -153,9 +153,9 @@ def _restart(buffers: PathBuffers, slot: int) -> None:
 @inline
 def restart_diagonals(buffers: PathBuffers, slots: Slots, x: int) -> None:
     """Let the diagonal paths that enter the image at column `x` begin anew."""
-    if buffers.diagonals and x == 0:
+    if len(buffers.diagonals) > 0 and x == 0:
         _restart(buffers, slots.from_left)
-    if buffers.diagonals and x == buffers.width - 1:
+    if len(buffers.diagonals) > 0 and x == buffers.width - 1:
         _restart(buffers, slots.from_right)
 
 
@@ -173,7 +173,7 @@ def enter_paths(buffers: PathBuffers, slots: Slots, penalties: int) -> Paths:
     straight = _enter_slot(buffers, slots.straight, penalties + 2 * buffers.width)
     from_left = straight
     from_right = straight
-    if buffers.diagonals:
+    if len(buffers.diagonals) > 0:
         from_left = _enter_slot(buffers, slots.from_left, penalties)
         from_right = _enter_slot(buffers, slots.from_right, penalties + 4 * buffers.width)
     return Paths(from_left, straight, from_right)
@@ -191,7 +191,7 @@ def advance_paths(buffers: PathBuffers, paths: Paths, n: int, cost: Any, like: A
     from_right = paths.from_right
     bracket, path_cost, straight = advance(buffers.state, paths.straight, block, top, cost)
     brackets = convert(bracket, like)
-    if buffers.diagonals:
+    if len(buffers.diagonals) > 0:
         bracket_left, _, from_left = advance(buffers.state, from_left, block, top, cost)
         bracket_right, _, from_right = advance(buffers.state, from_right, block, top, cost)
         brackets = add(brackets, add(convert(bracket_left, like), convert(bracket_right, like)))
@@ -202,7 +202,7 @@ def advance_paths(buffers: PathBuffers, paths: Paths, n: int, cost: Any, like: A
 def leave_paths(buffers: PathBuffers, slots: Slots, paths: Paths) -> Any:
     """End the step: write the smallest path costs; return that of the vertical path."""
     straight = paths.straight.smallest
-    if buffers.diagonals:
+    if len(buffers.diagonals) > 0:
         left, middle, right, _ = lowest_of_4(paths.from_left.smallest, straight, paths.from_right.smallest, straight)
         low = first_lane(middle)
         buffers.lowest[slots.from_left] = first_lane(left)

@@ -51,7 +51,9 @@ def start(buffers: PathBuffers) -> None:
     """Begin a sweep: no path has come from anywhere yet."""
     zero = splat(np.uint8(0))
     size = buffers.width * LANES * len(buffers.blocks)
-    for at in range(0 if buffers.diagonals else size, 3 * size if buffers.diagonals else 2 * size, LANES):
+    for at in range(
+        0 if len(buffers.diagonals) > 0 else size, 3 * size if len(buffers.diagonals) > 0 else 2 * size, LANES
+    ):
         store(buffers.state, at, zero)
     buffers.lowest[:] = 0
 
@@ -149,7 +151,7 @@ def first_visit(
     for k in range(abs(y1 - y0)):
         y = y0 + k * step
         cost_row(rows, y, buffers.cost)
-        write_penalties(guide, y, step, buffers.diagonals, False, penalties, 0, buffers.penalties)
+        write_penalties(guide, y, step, len(buffers.diagonals) > 0, False, penalties, 0, buffers.penalties)
         if (abs(y1 - y0) - k) * size > near:
             _leave_row(buffers, k, sums, y * size, True)
         else:
@@ -216,7 +218,9 @@ def prepare_rows(
             cost_row(rows, y + n * step, buffers.cost[n * size : (n + 1) * size])
     for n in range(count):
         place = 8 * n * buffers.width
-        write_penalties(guide, y + n * step, step, buffers.diagonals, True, penalties, place, buffers.penalties)
+        write_penalties(
+            guide, y + n * step, step, len(buffers.diagonals) > 0, True, penalties, place, buffers.penalties
+        )
     _horizontals(buffers, count)
 
 

@@ -99,12 +99,12 @@ def _labelled(source: Source, rows: int) -> Iterator[tuple[NDArray[np.int32], in
     for top in range(0, height, rows):
         zero = _black(source, top, min(top + rows, height), 0, width)
         count, labels = cv2.connectedComponents(zero.view(np.uint8), connectivity=4)
-        kept = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-        kept = kept[kept > 0]
+        at_sides = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+        at_sides = at_sides[at_sides > 0]
         number = np.zeros(count, np.int32)
-        number[kept] = np.arange(1, len(kept) + 1)
+        number[at_sides] = np.arange(1, len(at_sides) + 1)
         yield number[labels], offset
-        offset += len(kept)
+        offset += len(at_sides)
 
 
 def _unique(labels: NDArray[np.int32], offset: int) -> NDArray[np.int64]:

@@ -198,7 +198,8 @@ class MatchSettings:
 
     @property
     def _can_narrow(self) -> bool:
-        return bool(getattr(self.cost, "narrow", False) and getattr(self.aggregation, "narrow", False))
+        # Said by the class itself: one that inherits may have rows of its own, which know of no starts.
+        return all(vars(type(stage)).get("narrow", False) for stage in (self.cost, self.aggregation))
 
     @property
     def coarse_to_fine(self) -> bool:

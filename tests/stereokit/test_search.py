@@ -401,6 +401,15 @@ def test_what_cannot_search_so_says_so():
         Matcher("S2", search=None)
 
 
+def test_classes_that_inherit_search_in_full():
+    class Other(Census):
+        pass
+
+    settings = Matcher("S2", max_disparity=256).settings
+    assert settings.coarse_to_fine
+    assert not settings.replaced(cost=Other("5x5")).coarse_to_fine
+
+
 def test_the_gpu_searches_in_full():
     from stereokit import matching
 

@@ -47,10 +47,12 @@ class PairWatch:
     ----------
     scale : float
         Size of the matching, of which its time depends.
+    searched : int or None
+        Levels that a pixel tries at most; None for all of the range.
     """
 
-    def __init__(self, scale: float = 1.0) -> None:
-        self._scale = scale
+    def __init__(self, scale: float = 1.0, searched: int | None = None) -> None:
+        self._scale, self._searched = scale, searched
         self._lock = threading.Lock()
         self._seen = 0  # pairs that looked wrong
         self._looked_right = False  # the last of those that was looked at closely
@@ -72,7 +74,7 @@ class PairWatch:
         if same_pixels(pair.left, pair.right):
             return [same_fault()]
         density = np.count_nonzero(result.valid) / usable
-        low = density_fault(density, min_disparity, max_disparity)
+        low = density_fault(density, min_disparity, max_disparity, self._searched)
         cells = pair.left.size * (max_disparity - min_disparity) * self._scale**3
         signs = None
         if low is None:
@@ -124,7 +126,9 @@ def same_fault() -> Fault:
     return Fault("same", "left and right hold the same pixels: was one view given twice?")
 
 
-def density_fault(density: float, min_disparity: int, max_disparity: int) -> Fault | None:
+def density_fault(
+    density: float, min_disparity: int, max_disparity: int, searched: int | None = None
+) -> Fault | None:  # fmt: skip
     """Return the fault of a map whose density is too low, None if it is not.
 
     Parameters
@@ -133,8 +137,11 @@ def density_fault(density: float, min_disparity: int, max_disparity: int) -> Fau
         The share of measured pixels.
     min_disparity, max_disparity : int
         Of the matcher, pixels.
+    searched : int or None
+        Levels that a pixel tries at most; None for all of the range.
     """
-    if density >= min_density(max_disparity - min_disparity):
+    levels = max_disparity - min_disparity
+    if density >= min_density(levels if searched is None else min(levels, searched)):
         return None
     return Fault(
         "density",

@@ -183,7 +183,7 @@ class Matcher:
         """Set what every matcher has, however it is made."""
         self._pipeline = pipeline
         self.threads = threads
-        self._watch = PairWatch(self.scale)
+        self._watch = PairWatch(self.scale, self.settings.searched)
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
         """Return the bytes of the buffers for a pair; see `stereokit.pipeline.Pipeline`."""

@@ -213,6 +213,11 @@ class MatchSettings:
         return self.search == "coarse-to-fine" and self.matched_levels.count >= LANES
 
     @property
+    def searched(self) -> int | None:
+        """Levels that a pixel tries at most; None for all."""
+        return LANES if self.coarse_to_fine else None
+
+    @property
     def step(self) -> int:
         """Full-size pixels along a pixel of the matched size."""
         return round(1 / self.scale)

@@ -62,7 +62,7 @@ class BandAssembler:
         progress: Callable[[int, int], object] | None,
     ) -> None:
         self.measured, self.views_equal = 0, True
-        self._usable, self._watch, self._faults = 0, PairWatch(matcher.scale), list[Fault]()
+        self._usable, self._watch, self._faults = 0, PairWatch(matcher.scale, matcher.settings.searched), list[Fault]()
         self._image_matcher, self._sources, self._mapping, self._ranges = matcher, sources, mapping, ranges
         self._windows, self._progress = windows, progress
         self._height, self._width = sources[0].shape[:2]
@@ -123,7 +123,7 @@ class BandAssembler:
             return [unusable_fault()]
         if self.views_equal:
             return [same_fault()]
-        low = density_fault(self.measured / self._usable, *self._range)
+        low = density_fault(self.measured / self._usable, *self._range, self._image_matcher.settings.searched)
         closer = [fault for fault in self._faults if fault.kind not in _OF_WINDOWS]
         if low is not None:
             return closer or [low]

@@ -119,7 +119,9 @@ def matcher_kinds(method: str, case: Case) -> set[str]:
     matcher = Matcher(method, min_disparity=case.min_disparity, max_disparity=case.max_disparity)
     pair = gray_pair(case.left, case.right)
     result = matcher.match_gray(pair, matcher.threads)
-    faults = PairWatch(matcher.scale).faults(pair, result, case.min_disparity, case.max_disparity)
+    faults = PairWatch(matcher.scale, matcher.settings.searched).faults(
+        pair, result, case.min_disparity, case.max_disparity
+    )
     return {fault.kind for fault in faults}
 
 
@@ -137,7 +139,7 @@ def look_cost(
     threads, rounds : int
     """
     matcher = Matcher(method, max_disparity=width // 10, threads=threads)
-    watch, times = PairWatch(), []
+    watch, times = PairWatch(searched=matcher.settings.searched), []
     for turn in range(rounds + 1):
         for _, *views in pairs:
             size = width, round(views[0].shape[0] * width / views[0].shape[1])

@@ -52,7 +52,7 @@ def document():
         row("x", "peer", 5.5, name="my_net & 50% <b>|#"),
     ]
     machine = {"cpu": "a processor"}
-    return {"results": rows, "dataset": "folder", "split": None, "frames": ["f_0", "f_1"], "machine": machine}
+    return {"results": rows, "dataset": "kitti2015", "split": None, "frames": ["f_0", "f_1"], "machine": machine}
 
 
 def read_csv(text):
@@ -242,3 +242,19 @@ def test_what_is_no_study_is_refused(tmp_path, content):
     done = CliRunner().invoke(APP, [str(tmp_path)])
     assert isinstance(done.exception, FileError) and "\n" not in str(done.exception)
     assert not (tmp_path / "tables").exists()
+
+
+def test_a_chart_shows_the_pixels_that_there_are_and_times_may_be_missing(document):
+    pytest.importorskip("matplotlib")
+    document["dataset"] = "folder"
+    for entry in document["results"]:
+        entry["d1"]["noc"] = dict.fromkeys(("all", "bg", "fg"))
+    figures = charts.figures(document)
+    assert [x for x in figures["chart-d1"]["data"][-1]["x"] if x is not None] == [5.123456789, 4.987654321, 6.5]
+    for entry in document["results"]:  # nothing at all: an axis of times has no point
+        entry["d1"]["occ"] = dict.fromkeys(("all", "bg", "fg"))
+    for figure in charts.figures(document).values():
+        assert draw(figure, "svg").startswith(b"<?xml")
+    for entry in document["results"]:
+        entry["ms"] = {}
+    assert list(charts.figures(document)) == ["chart-d1"]

@@ -166,7 +166,12 @@ def study(
             functions, command or (), predictions or (), max_disparity=part.levels, time_limit=time_limit,
             dataset=part.name,
         )  # fmt: skip
-        return rows + [outside(other) for other in others]
+        rows += [outside(other) for other in others]
+        names = [row.name for row in rows]
+        for name in names:
+            if names.count(name) > 1:
+                raise OptionError(f"methods must have different names, got {name!r} twice; use another NAME=...")
+        return rows
 
     rows_by_part = [configurations_of(part) for part in parts]
     for part, rows in zip(parts, rows_by_part, strict=True):
@@ -210,13 +215,13 @@ def study(
     title = ", ".join(part.name for part in parts)
     stopped = whole.interrupted or any(study.interrupted for study in disturbed)
     document = {
-        **as_json(whole),
+        **as_json(whole, parts[0].dataset if len(parts) == 1 else None),
         "interrupted": stopped,
         "dataset": title,
         "split": parts[0].split if len(parts) == 1 else None,
         "frames": [frame.name for frame in used],
         "frames_with_truth": _with_truth(whole),
-        "comparison": comparison(title, used),
+        "comparison": _comparison(parts, studies, title, used),
         "source_of_published": PAPER,
         "warnings": list(itertools.chain.from_iterable(part.warnings for part in parts)),
         "options": {
@@ -294,8 +299,9 @@ def _part_json(part: DataPart, result: Study, faulty: DisturbedStudy | None) -> 
     """Return one data set's entry of ``data``."""
     benchmarks = {frame.name: frame.benchmark.name for frame in part.frames if frame.benchmark is not None}
     return {
-        **as_json(result),
+        **as_json(result, part.dataset),
         "dataset": part.dataset,
+        "frames_with_truth": _with_truth(result),
         "root": None if part.root is None else str(part.root),
         "split": part.split,
         "frames": [frame.name for frame in part.frames],
@@ -316,11 +322,21 @@ def _print(
         if len(parts) == 1:
             counts = document["frames_with_truth"]
             long = f"{heading}, {count_frames(used)} (noc {counts['noc']}, occ {counts['occ']}, "
-            print_tables(f"{long}with objects {counts['objects']})", result, document["comparison"])
+            heading_of_all = f"{long}with objects {counts['objects']})"
+            print_tables(heading_of_all, result, document["comparison"], part.dataset)
         print_measures(f"{heading}, {count_frames(used)}", result, documents[part.name]["official"])
     if len(parts) > 1:
         print_overview({part.name: result for part, result in zip(parts, studies, strict=True)})
     print_disturbances(document["disturbances"])
+
+
+def _comparison(parts: Sequence[DataPart], studies: Sequence[Study], title: str, used: Sequence[Frame]) -> str:
+    """Return the line about the published figures: they are of KITTI 2015, and stand beside that alone."""
+    for part, result in zip(parts, studies, strict=True):
+        if part.dataset == "kitti2015":
+            scored = {frame.name for row in result.rows for frame in row.result.frames}
+            return comparison("kitti2015", [frame for frame in part.frames if frame.name in scored])
+    return comparison(title, used)
 
 
 def _with_truth(result: Study) -> dict[str, int]:

@@ -16,7 +16,7 @@ from stereokit_evaluation.report.tables import study_tables
 __all__ = ["write_exports"]
 
 _LONG = ("pairs", "measures_by_pixels", "comparisons")  # tables for programs, as CSV alone
-_NAMES = {"chart-e4": "d1_validation", "chart-e5": "d1_test", "chart-time": "accuracy_time"}
+_NAMES = {"chart-d1": "d1", "chart-e4": "d1_validation", "chart-e5": "d1_test", "chart-time": "accuracy_time"}
 
 
 def write_exports(document: Mapping[str, Any], folder: Path) -> list[Path]:

@@ -99,7 +99,9 @@ def test_latex_marks_the_best_and_escapes(document):
     assert "D1 noc bg" not in lines[3]  # nothing stands in it
     assert cells(lines[6])[2].strip() == r"\textbf{3.99}" and cells(lines[5])[2].strip() == "4.12"
     assert cells(lines[7])[2].strip() == "--"
-    assert r"my\_net \& 50\% <b>|\#" in lines[8]
+    assert r"my\_net \& 50\% \textless{}b\textgreater{}\textbar{}\#" in lines[8]
+    rows = Table("t", (Column("a", None),), (("[x]",), ("*",))).latex().splitlines()
+    assert rows[5:7] == [r"{[}x] \\", r"{*} \\"]  # no argument of the \midrule and \\ before them
     odd = Table("t", (Column("a", None),), (("\\~^{}$",),)).latex()
     assert r"\textbackslash{}\textasciitilde{}\textasciicircum{}\{\}\$" in odd
 

@@ -119,6 +119,19 @@ def test_other_data_have_no_published_figures_beside_them(pairs, kitti, tmp_path
     assert "measured here, K" in (tmp_path / "both" / "charts" / "d1_test.csv").read_text()
 
 
+def test_tables_of_an_earlier_study_do_not_stay_beside_the_new_ones(pairs, kitti, tmp_path):
+    words = ["--data", f"kitti2015:{kitti}", "--data", f"folder:{pairs}", "-o", str(tmp_path / "out"), *SMALL]
+    assert CliRunner().invoke(APP, [*words, "--method", "S2", "--variant", "original"]).exit_code == 0
+    (tmp_path / "out" / "tables" / "own.csv").write_text("mine")
+    assert (tmp_path / "out" / "tables" / "kitti2015_accuracy.csv").exists()
+    assert command(pairs, tmp_path / "out", "--method", "S2", "--variant", "original").exit_code == 0
+    names = {path.name for part in ("tables", "charts") for path in (tmp_path / "out" / part).iterdir()}
+    assert not any(name.startswith(("kitti2015_", "folder_", "d1_")) for name in names)
+    assert {"own.csv", "accuracy.tex", "pairs.csv", "d1.csv"} <= names
+    (tmp_path / "out" / "study.json").write_text('{"results": 1}')
+    assert command(pairs, tmp_path / "out", "--method", "S2", "--variant", "original").exit_code == 0
+
+
 def test_two_rows_have_different_names(pairs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "flat_map.py").write_text(

@@ -19,8 +19,8 @@ import typer
 
 from stereokit import METHODS, __version__
 from stereokit.cli.options import DeviceOption, JsonOption, WeightsOption, check_json, parse_settings, write_json
-from stereokit.errors import OptionError
-from stereokit.io import check_output
+from stereokit.errors import FileError, OptionError
+from stereokit.io import check_output, read_json
 from stereokit.kernels.threads import available_threads
 from stereokit_evaluation.bench.baselines import HH, THREE_WAY, opencv_threads
 from stereokit_evaluation.bench.table import machine, system_load, versions
@@ -237,9 +237,10 @@ def study(
         "versions": versions(),
         "machine": machine_info,
     }
+    before = _earlier(output / "study.json")
     write_json(make_folder(output) / "study.json", document)
     if used:
-        write_exports(document, output)
+        write_exports(document, output, before)
     if not write_json(json_file, document):
         _print(parts, studies, documents, document)
     if report and used:
@@ -328,6 +329,15 @@ def _print(
     if len(parts) > 1:
         print_overview({part.name: result for part, result in zip(parts, studies, strict=True)})
     print_disturbances(document["disturbances"])
+
+
+def _earlier(path: Path) -> dict[str, Any] | None:
+    """Return the JSON of the study that was in the folder, None where there is none that can be read."""
+    try:
+        document = read_json(path, "study")
+    except FileError:
+        return None
+    return document if isinstance(document, dict) else None
 
 
 def _comparison(parts: Sequence[DataPart], studies: Sequence[Study], title: str, used: Sequence[Frame]) -> str:

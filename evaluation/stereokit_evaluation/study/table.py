@@ -331,7 +331,7 @@ def _head(figure: str) -> str:
 
 
 def _accuracy(heading: str, rows: Sequence[StudyRow], dataset: str) -> Table:
-    table = _table(f"{heading}: D1 in percent, EPE in pixels; density and EPE of noc where any frame has it")
+    table = _table(f"{heading}: D1 in percent, EPE in pixels; density, EPE: noc if any")
     paper_heads = ("published e4", "published e5, noc") if dataset == "kitti2015" else ()
     heads = (*(f"{region} {part}" for region, part in _D1), "density", "EPE", *paper_heads)
     for head in heads:

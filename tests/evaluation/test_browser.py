@@ -55,11 +55,15 @@ def study_file(tmp_path_factory):
 
     from stereokit_evaluation.commands.study import study
     from stereokit_evaluation.data import datasets
+    from stereokit_evaluation.report import charts
 
     out, app = tmp_path_factory.mktemp("study"), Typer()
     app.command()(study)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets, "_SCENE_SIZE", (320, 192))
+        patch.setattr(
+            charts, "kitti_part", lambda study: {"name": "scenes", **study["data"]["scenes"]}
+        )  # as if of KITTI
         datasets._scene.cache_clear()
         words = ["--count", "3", "--max-disparity", "64", "--threads", "1", "--repeats", "1", "--no-peers"]
         words += ["--variant", "linear", "--variant", "original", "-o", str(out)]

@@ -52,7 +52,7 @@ def document():
         row("x", "peer", 5.5, name="my_net & 50% <b>|#"),
     ]
     machine = {"cpu": "a processor"}
-    return {"results": rows, "dataset": "folder", "split": None, "frames": ["f_0", "f_1"], "machine": machine}
+    return {"results": rows, "dataset": "kitti2015", "split": None, "frames": ["f_0", "f_1"], "machine": machine}
 
 
 def read_csv(text):
@@ -99,7 +99,9 @@ def test_latex_marks_the_best_and_escapes(document):
     assert "D1 noc bg" not in lines[3]  # nothing stands in it
     assert cells(lines[6])[2].strip() == r"\textbf{3.99}" and cells(lines[5])[2].strip() == "4.12"
     assert cells(lines[7])[2].strip() == "--"
-    assert r"my\_net \& 50\% <b>|\#" in lines[8]
+    assert r"my\_net \& 50\% \textless{}b\textgreater{}\textbar{}\#" in lines[8]
+    rows = Table("t", (Column("a", None),), (("[x]",), ("*",))).latex().splitlines()
+    assert rows[5:7] == [r"{[}x] \\", r"{*} \\"]  # no argument of the \midrule and \\ before them
     odd = Table("t", (Column("a", None),), (("\\~^{}$",),)).latex()
     assert r"\textbackslash{}\textasciitilde{}\textasciicircum{}\{\}\$" in odd
 
@@ -242,3 +244,19 @@ def test_what_is_no_study_is_refused(tmp_path, content):
     done = CliRunner().invoke(APP, [str(tmp_path)])
     assert isinstance(done.exception, FileError) and "\n" not in str(done.exception)
     assert not (tmp_path / "tables").exists()
+
+
+def test_a_chart_shows_the_pixels_that_there_are_and_times_may_be_missing(document):
+    pytest.importorskip("matplotlib")
+    document["dataset"] = "folder"
+    for entry in document["results"]:
+        entry["d1"]["noc"] = dict.fromkeys(("all", "bg", "fg"))
+    figures = charts.figures(document)
+    assert [x for x in figures["chart-d1"]["data"][-1]["x"] if x is not None] == [5.123456789, 4.987654321, 6.5]
+    for entry in document["results"]:  # nothing at all: an axis of times has no point
+        entry["d1"]["occ"] = dict.fromkeys(("all", "bg", "fg"))
+    for figure in charts.figures(document).values():
+        assert draw(figure, "svg").startswith(b"<?xml")
+    for entry in document["results"]:
+        entry["ms"] = {}
+    assert list(charts.figures(document)) == ["chart-d1"]

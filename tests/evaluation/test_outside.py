@@ -78,6 +78,52 @@ def module(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
+def test_a_function_cannot_change_the_images_of_others(frame, module):
+    name = module("def run(left, right):\n    left[:] = 0\n    return np.full(left.shape[:2], 5.0)")
+    left, right = image(30), image(40)
+    assert (outside_function(f"{name}:run", 16)(frame, left, right).disparity == 5).all()
+    assert (left == 30).all() and (right == 40).all()
+
+
+def test_a_function_that_ends_python_costs_its_frame_alone(frame, module):
+    name = module("import sys\ndef run(left, right):\n    sys.exit(3)")
+    with pytest.raises(InputError, match=f"{name}:run ended Python: SystemExit: 3"):
+        outside_function(f"{name}:run", 16)(frame, image(30), image(40))
+    with pytest.raises(OptionError, match="can be imported"):
+        outside_function(module("import sys\nsys.exit(2)", "module_that_ends") + ":run", 16)
+
+
+def test_a_result_depends_on_the_modules_that_a_function_uses(module, tmp_path):
+    def identity(helper):
+        for name in ("own_helper", "own_stereo_module"):
+            sys.modules.pop(name, None)
+        module(helper, "own_helper")
+        name = module("from own_helper import shift\ndef run(left, right):\n    return shift")
+        return outside_function(f"{name}:run", 16).identity()
+
+    first = identity("shift = 1")
+    assert list(first["modules"]) == ["own_helper.py"]
+    assert first == identity("shift = 1") != identity("shift = 22")
+    module("value = 1", "another_module")  # beside it, and not used
+    assert identity("shift = 1") == first
+
+
+def test_a_package_has_its_own_modules_alone(tmp_path, monkeypatch):
+    package = tmp_path / "site-packages" / "own_stereo_package"
+    (package / "net").mkdir(parents=True)
+    texts = {"__init__": "", "api": "def run(left, right):\n    from .net import layers\n    import other_package\n"}
+    for name, text in {**texts, "net/__init__": "", "net/layers": "from .. import weights", "weights": "w = 1"}.items():
+        (package / f"{name}.py").write_text(text)
+    (package.parent / "other_package.py").write_text("value = 1")
+    monkeypatch.syspath_prepend(str(package.parent))
+    modules = outside_function("own_stereo_package.api:run", 16).identity()["modules"]
+    assert sorted(modules) == [
+        f"own_stereo_package/{name}.py" for name in ("__init__", "net/__init__", "net/layers", "weights")
+    ]
+    for name in [name for name in sys.modules if name.startswith("own_stereo_package")]:
+        del sys.modules[name]
+
+
 def test_a_program_reads_the_files_and_its_map_is_read(frame, script):
     method = program(script(SAVE, "{left} {right} {out.npy} {max_disparity}"), 64)
     result, seconds = method.timed(frame, image(30), image(40))

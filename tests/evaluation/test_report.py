@@ -49,6 +49,9 @@ def study_page(tmp_path_factory):
     out = tmp_path_factory.mktemp("study")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets, "_SCENE_SIZE", (160, 96))
+        patch.setattr(
+            charts, "kitti_part", lambda study: {"name": "scenes", **study["data"]["scenes"]}
+        )  # as if of KITTI
         datasets._scene.cache_clear()
         words = ["--count", 3, "--method", "S2", "--variant", "linear", "--variant", "original", "--variant", "cnn"]
         words += ["--max-disparity", 32, "--threads", 1, "--repeats", 1, "--show", 2, "-o", out]
@@ -103,6 +106,23 @@ def test_published_bars_stand_beside_ours(study_page):
     assert any(trace["name"] == "other methods, this machine" for trace in points)
     shapes = [trace["marker"]["symbol"] for trace in points]
     assert len(set(shapes)) == len(shapes)  # settings differ by more than colour
+
+
+def test_published_figures_stand_beside_kitti_2015_alone(study_page):
+    document, _ = study_page
+    rows, part = document["results"], document["data"]["scenes"]
+    assert not any(value for row in rows for value in row["published"].values())
+    names = {key: [t["name"] for t in figure["data"]] for key, figure in charts.figures(document).items()}
+    assert list(names) == ["chart-d1", "chart-time"] and names["chart-d1"] == ["measured here, scenes"]
+    assert not any("published" in name for name in names["chart-time"])
+    kitti = {**part, "dataset": "kitti2015", "results": [{**row, "ms": {"total": 5.0}} for row in rows]}
+    both = {**document, "dataset": "scenes, K", "data": {"scenes": part, "K": kitti}}
+    figures = charts.figures(both)
+    assert list(figures) == ["chart-d1", "chart-e4", "chart-e5", "chart-time"]
+    assert [trace["name"] for trace in figures["chart-d1"]["data"]] == ["measured here, scenes, K"]
+    assert [trace["name"] for trace in figures["chart-e5"]["data"]] == ["published", "measured here, K"]
+    assert figures["chart-time"]["data"][0]["y"] == [5.0]  # those of KITTI, not the pooled ones
+    assert all(len(x) == len(f["data"]) for f in figures.values() for x in f["variants"]["x"].values())
 
 
 def test_the_maps_are_those_of_the_matchers(study_page):

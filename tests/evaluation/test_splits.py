@@ -57,4 +57,4 @@ def test_bad_splits_are_refused():
 
 
 def test_other_data_sets_say_so():
-    assert comparison("scenes", kitti(0)).startswith("Not the same frames")
+    assert comparison("scenes", kitti(0)).startswith("No published figures: they are of KITTI 2015")

@@ -78,13 +78,84 @@ def run(root, output, *words, status=0):
     return json.loads(done.stdout)
 
 
-def test_the_table_has_ours_and_the_published_figures(pairs, tmp_path):
-    words = ("--method", "S4", "--method", "S2", "--variant", "linear", "--setting", "original")
-    done = command(pairs, tmp_path / "out", *words)
+@pytest.fixture
+def kitti(pairs):
+    """Return the same pairs in the layout of KITTI 2015, the last without truth of not occluded pixels."""
+    root = pairs.parent / "kitti" / "training"
+    for old, new in (("left", "image_2"), ("right", "image_3"), ("disparity", "disp_occ_0")):
+        (root / new).mkdir(parents=True)
+        for file in sorted((pairs / old).iterdir()):
+            (root / new / f"000{file.stem}_10.png").write_bytes(file.read_bytes())
+    (root / "disp_noc_0").mkdir()
+    for name in ("000000_10.png", "000001_10.png"):
+        (root / "disp_noc_0" / name).write_bytes((root / "disp_occ_0" / name).read_bytes())
+    return root.parent
+
+
+def test_the_table_has_ours_and_the_published_figures(kitti, tmp_path):
+    words = ["--data", f"kitti2015:{kitti}", "-o", str(tmp_path / "out"), *SMALL]
+    words += ["--method", "S4", "--method", "S2", "--variant", "linear", "--setting", "original"]
+    done = CliRunner().invoke(APP, words)
     assert done.exit_code == 0, done.output
     rows = [line.split() for line in done.stdout.splitlines() if line.startswith(" S4")]
     assert rows[0][1] == "Mini+Linear" and rows[0][-2:] == ["9.56", "7.47"]
     assert "published" in done.stdout and "Not the same frames" in done.stdout
+    document = json.loads((tmp_path / "out" / "study.json").read_text())
+    linear, original, *_ = document["results"]
+    assert linear["published"] == {"validation_d1": 9.56, "test_d1_noc": 7.47, "agx_ms": None}
+    assert original["published"]["agx_ms"] == 12.64
+
+
+def test_other_data_have_no_published_figures_beside_them(pairs, kitti, tmp_path):
+    done = command(pairs, tmp_path / "folder", "--method", "S4", "--variant", "linear")
+    assert done.exit_code == 0 and "9.56" not in done.stdout and "published e4" not in done.stdout
+    assert "No published figures: they are of KITTI 2015" in done.stdout
+    words = ["--data", f"folder:{pairs}", "--data", f"K=kitti2015:{kitti}", "-o", str(tmp_path / "both"), *SMALL]
+    assert CliRunner().invoke(APP, [*words, "--method", "S4", "--variant", "linear"]).exit_code == 0
+    tables = tmp_path / "both" / "tables"
+    has = {name: "9.56" in (tables / f"{name}accuracy.csv").read_text() for name in ("", "folder_", "K_")}
+    assert has == {"": False, "folder_": False, "K_": True}
+    assert (tmp_path / "both" / "charts" / "d1.csv").exists()
+    assert "measured here, K" in (tmp_path / "both" / "charts" / "d1_test.csv").read_text()
+
+
+def test_tables_of_an_earlier_study_do_not_stay_beside_the_new_ones(pairs, kitti, tmp_path):
+    words = ["--data", f"kitti2015:{kitti}", "--data", f"folder:{pairs}", "-o", str(tmp_path / "out"), *SMALL]
+    assert CliRunner().invoke(APP, [*words, "--method", "S2", "--variant", "original"]).exit_code == 0
+    (tmp_path / "out" / "tables" / "own.csv").write_text("mine")
+    assert (tmp_path / "out" / "tables" / "kitti2015_accuracy.csv").exists()
+    assert command(pairs, tmp_path / "out", "--method", "S2", "--variant", "original").exit_code == 0
+    names = {path.name for part in ("tables", "charts") for path in (tmp_path / "out" / part).iterdir()}
+    assert not any(name.startswith(("kitti2015_", "folder_", "d1_")) for name in names)
+    assert {"own.csv", "accuracy.tex", "pairs.csv", "d1.csv"} <= names
+    (tmp_path / "out" / "study.json").write_text('{"results": 1}')
+    assert command(pairs, tmp_path / "out", "--method", "S2", "--variant", "original").exit_code == 0
+
+
+def test_two_rows_have_different_names(pairs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "flat_map.py").write_text(
+        "def run(left, right):\n    return left[..., 0] if left.ndim == 3 else left\n"
+    )
+    done = command(
+        pairs, tmp_path / "out", "--method", "S2", "--variant", "original", "--method", "S2 Original=flat_map:run"
+    )
+    assert isinstance(done.exception, OptionError) and "'S2 Original' twice" in str(done.exception)
+    done = command(pairs, tmp_path / "out", "--method", "a:boom:=flat_map:run", "--method", "x:boom:[b]=flat_map:run")
+    assert done.exit_code == 0 and "a:boom:" in done.stdout and "x:boom:[b]" in done.stdout
+
+
+def test_tables_say_how_many_frames_have_which_truth(kitti, tmp_path):
+    words = ["--data", f"kitti2015:{kitti}", "-o", str(tmp_path / "out"), *SMALL, "--method", "S4"]
+    done = CliRunner().invoke(APP, [*words, "--variant", "original"])
+    assert "seen by both cameras in 2 of them, all with truth, occluded ones too, in the other" in " ".join(
+        done.stdout.split()
+    )
+    for name in ("accuracy", "measures"):
+        assert (
+            "3 frames of kitti2015, all (noc: 2 of them, occ: 3)"
+            in (tmp_path / "out" / "tables" / f"{name}.md").read_text()
+        )
 
 
 def test_the_json_has_everything(pairs, tmp_path):
@@ -99,8 +170,6 @@ def test_the_json_has_everything(pairs, tmp_path):
     assert (original["setting"], original["refiner"], original["scale"]) == ("Original", None, 1.0)
     assert set(linear["ms"]) == {"total", "prepare", "match", "clean", "refine", "other"}
     assert linear["ms"]["refine"] > 0 and original["ms"]["refine"] == 0
-    assert linear["published"] == {"validation_d1": 9.56, "test_d1_noc": 7.47, "agx_ms": None}
-    assert original["published"]["agx_ms"] == 12.64
     assert linear["images"] == 3 and document["frames"] == ["000", "001", "002"]
     assert document["frames_with_truth"] == {"noc": 0, "occ": 3, "objects": 0}
     assert linear["d1"]["occ"]["all"] is not None and linear["d1"]["noc"]["all"] is None

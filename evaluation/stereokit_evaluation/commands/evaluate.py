@@ -144,7 +144,7 @@ def evaluate(
     if not write_json(json_file, document):
         _print_table(f"{dataset}, {len(selected)} frames", runs, results)
         if results and results[0].frames:
-            typer.echo(pixels_line(results[0]))
+            typer.echo(f"{pixels_line(results[0])}{_columns_line(results[0])}")
     if interrupted:
         raise typer.Exit(130)
     if skipped:
@@ -229,6 +229,12 @@ def _print_table(title: str, runs: Sequence[_Run], results: Sequence[Result]) ->
             "-" if seconds is None else f"{1000 * seconds:.1f}",
         )
     Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+def _columns_line(result: Result) -> str:
+    """Return how many pairs the D1 columns count, where these are not all."""
+    pairs, noc, occ = (getattr(result.measures, name).pairs for name in ("main", "noc", "all"))
+    return "" if noc in (0, pairs) else f" D1 noc, bg, fg: {noc} of the pairs; D1 occ: {occ}."
 
 
 def _half(scale: float | None) -> str:

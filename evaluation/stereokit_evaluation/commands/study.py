@@ -19,8 +19,8 @@ import typer
 
 from stereokit import METHODS, __version__
 from stereokit.cli.options import DeviceOption, JsonOption, WeightsOption, check_json, parse_settings, write_json
-from stereokit.errors import OptionError
-from stereokit.io import check_output
+from stereokit.errors import FileError, OptionError
+from stereokit.io import check_output, read_json
 from stereokit.kernels.threads import available_threads
 from stereokit_evaluation.bench.baselines import HH, THREE_WAY, opencv_threads
 from stereokit_evaluation.bench.table import machine, system_load, versions
@@ -166,7 +166,12 @@ def study(
             functions, command or (), predictions or (), max_disparity=part.levels, time_limit=time_limit,
             dataset=part.name,
         )  # fmt: skip
-        return rows + [outside(other) for other in others]
+        rows += [outside(other) for other in others]
+        names = [row.name for row in rows]
+        for name in names:
+            if names.count(name) > 1:
+                raise OptionError(f"methods must have different names, got {name!r} twice; use another NAME=...")
+        return rows
 
     rows_by_part = [configurations_of(part) for part in parts]
     for part, rows in zip(parts, rows_by_part, strict=True):
@@ -210,13 +215,13 @@ def study(
     title = ", ".join(part.name for part in parts)
     stopped = whole.interrupted or any(study.interrupted for study in disturbed)
     document = {
-        **as_json(whole),
+        **as_json(whole, parts[0].dataset if len(parts) == 1 else None),
         "interrupted": stopped,
         "dataset": title,
         "split": parts[0].split if len(parts) == 1 else None,
         "frames": [frame.name for frame in used],
         "frames_with_truth": _with_truth(whole),
-        "comparison": comparison(title, used),
+        "comparison": _comparison(parts, studies, title, used),
         "source_of_published": PAPER,
         "warnings": list(itertools.chain.from_iterable(part.warnings for part in parts)),
         "options": {
@@ -232,9 +237,10 @@ def study(
         "versions": versions(),
         "machine": machine_info,
     }
+    before = _earlier(output / "study.json")
     write_json(make_folder(output) / "study.json", document)
     if used:
-        write_exports(document, output)
+        write_exports(document, output, before)
     if not write_json(json_file, document):
         _print(parts, studies, documents, document)
     if report and used:
@@ -294,8 +300,9 @@ def _part_json(part: DataPart, result: Study, faulty: DisturbedStudy | None) -> 
     """Return one data set's entry of ``data``."""
     benchmarks = {frame.name: frame.benchmark.name for frame in part.frames if frame.benchmark is not None}
     return {
-        **as_json(result),
+        **as_json(result, part.dataset),
         "dataset": part.dataset,
+        "frames_with_truth": _with_truth(result),
         "root": None if part.root is None else str(part.root),
         "split": part.split,
         "frames": [frame.name for frame in part.frames],
@@ -316,11 +323,30 @@ def _print(
         if len(parts) == 1:
             counts = document["frames_with_truth"]
             long = f"{heading}, {count_frames(used)} (noc {counts['noc']}, occ {counts['occ']}, "
-            print_tables(f"{long}with objects {counts['objects']})", result, document["comparison"])
+            heading_of_all = f"{long}with objects {counts['objects']})"
+            print_tables(heading_of_all, result, document["comparison"], part.dataset)
         print_measures(f"{heading}, {count_frames(used)}", result, documents[part.name]["official"])
     if len(parts) > 1:
         print_overview({part.name: result for part, result in zip(parts, studies, strict=True)})
     print_disturbances(document["disturbances"])
+
+
+def _earlier(path: Path) -> dict[str, Any] | None:
+    """Return the JSON of the study that was in the folder, None where there is none that can be read."""
+    try:
+        document = read_json(path, "study")
+    except FileError:
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def _comparison(parts: Sequence[DataPart], studies: Sequence[Study], title: str, used: Sequence[Frame]) -> str:
+    """Return the line about the published figures: they are of KITTI 2015, and stand beside that alone."""
+    for part, result in zip(parts, studies, strict=True):
+        if part.dataset == "kitti2015":
+            scored = {frame.name for row in result.rows for frame in row.result.frames}
+            return comparison("kitti2015", [frame for frame in part.frames if frame.name in scored])
+    return comparison(title, used)
 
 
 def _with_truth(result: Study) -> dict[str, int]:

@@ -32,7 +32,7 @@ def progress(total: int | None) -> Iterator[tuple[Console, Callable[..., None]]]
     step : callable
         ``step(text, advance=1)`` reports a finished step.
     """
-    console = Console(stderr=True)
+    console = Console(stderr=True, emoji=False)  # a method may be called mine:boom:
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not console.is_terminal)
     task = bar.add_task("", total=total)

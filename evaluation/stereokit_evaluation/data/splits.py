@@ -81,9 +81,7 @@ def comparison(dataset: str, frames: Sequence[Frame]) -> str:
         f"the paper's {VALIDATION_FRAMES} validation frames (e4) and {TEST_FRAMES} test frames (e5) of KITTI 2015"
     )
     if dataset != "kitti2015":
-        return (
-            f"Not the same frames: published figures are of {published}, ours of {count_frames(frames)} of {dataset}."
-        )
+        return f"No published figures: they are of KITTI 2015, ours of {count_frames(frames)} of {dataset}."
     shared = sum(split_of(frame) == "validation" for frame in frames)
     if shared == len(frames) == VALIDATION_FRAMES:
         return (

@@ -17,7 +17,7 @@ from stereokit_evaluation.data import published
 from stereokit_evaluation.report.disturbance_charts import disturbance_charts
 from stereokit_evaluation.study.configurations import BASELINE, PAPER_VARIANTS, title
 
-__all__ = ["REGIONS", "accuracy_time", "bars", "colour", "figures", "row_name", "symbol"]
+__all__ = ["REGIONS", "accuracy_time", "bars", "colour", "figures", "first_region", "kitti_part", "row_name", "symbol"]
 
 REGIONS = {
     "noc all": "not occluded, all",
@@ -42,14 +42,36 @@ JsonRow = Mapping[str, Any]
 
 def figures(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return all charts of a study's JSON, by the id of the element of the page that they go to."""
-    rows = document["results"]
-    charts = {
-        "chart-e4": bars(rows, "e4", document["dataset"]),
-        "chart-e5": bars(rows, "e5", document["dataset"]),
-        "chart-time": accuracy_time(rows),
-    }
+    rows, name, kitti = document["results"], document["dataset"], kitti_part(document)
+    region = first_region(rows)
+    charts = {} if kitti is not None and kitti["name"] == name else {"chart-d1": bars(rows, None, name, region)}
+    if kitti is not None:
+        charts |= {f"chart-{figure}": bars(kitti["results"], figure, kitti["name"], region) for figure in ("e4", "e5")}
+    times = accuracy_time(rows if kitti is None else kitti["results"], region, beside_paper=kitti is not None)
+    charts |= {"chart-time": times} if times["data"] else {}  # finished maps have no times
     faults = disturbance_charts(document.get("disturbances") or {})
     return charts | {f"chart-fault-{kind}": _titled(kind, chart) for kind, chart in faults.items()}
+
+
+def kitti_part(document: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the part of a study that stands beside published figures, which are of KITTI 2015; None without it.
+
+    Returns
+    -------
+    dict or None
+        ``name`` of the data set, its ``results``, and ``frames_with_truth`` (by kind of truth, or None).
+    """
+    parts = document.get("data") or {document["dataset"]: document}
+    for name, part in parts.items():
+        if part["dataset"] == "kitti2015":
+            return {"name": name, "results": part["results"], "frames_with_truth": part.get("frames_with_truth")}
+    return None
+
+
+def first_region(rows: Sequence[JsonRow]) -> str:
+    """Return the first of `REGIONS` that any row has a figure of."""
+    scored = (region for region in REGIONS if any(_d1(row, region) is not None for row in rows))
+    return next(scored, "noc all")
 
 
 def _titled(kind: str, chart: dict[str, Any]) -> dict[str, Any]:
@@ -76,19 +98,21 @@ def symbol(variant: str, variants: Sequence[str]) -> str:
     return _SYMBOLS.get(variant) or _OTHER_SYMBOLS[others.index(variant) % len(_OTHER_SYMBOLS)]
 
 
-def bars(rows: Sequence[JsonRow], figure: str, name: str) -> dict[str, Any]:
-    """Return one of the paper's bar charts, with our bars and the published ones: a row each, matcher by matcher.
+def bars(rows: Sequence[JsonRow], figure: str | None, name: str, region: str = "noc all") -> dict[str, Any]:
+    """Return D1 errors as bars, a row each, matcher by matcher; beside the published ones of one of the paper's charts.
 
     Parameters
     ----------
     rows : sequence of dict
         ``results`` of the study's JSON.
-    figure : {"e4", "e5"}
-        Which of the two.
+    figure : {"e4", "e5"} or None
+        Which of the two; None for data that the paper has no figures of.
     name : str
         The data set, for the legend.
+    region : str
+        Of `REGIONS`: the one that is drawn at first.
     """
-    paper = {"e4": published.VALIDATION, "e5": published.TEST}[figure]
+    paper = {} if figure is None else {"e4": published.VALIDATION, "e5": published.TEST}[figure]
     ours = [row for row in rows if row["setting"] != BASELINE]
     matchers = list(dict.fromkeys(row["matcher"] for row in ours))
     variants = list(dict.fromkeys(_variant(row) for row in ours))
@@ -105,16 +129,14 @@ def bars(rows: Sequence[JsonRow], figure: str, name: str) -> dict[str, Any]:
             colours.append(_BASELINE_COLOUR)
             scored.append(row)
     printed = [paper.get(m, {}).get(s) for m, s in cells] + [None] * (len(labels) - len(cells))
-    values = {region: [None if row is None else _d1(row, region) for row in scored] for region in REGIONS}
+    values = {key: [None if row is None else _d1(row, key) for row in scored] for key in REGIONS}
     hatched = {
         "color": colours,
         "pattern": {"shape": "/", "fgcolor": colours, "bgcolor": "rgba(0,0,0,0)", "size": 6},
         "line": {"color": colours, "width": 1.5},
     }
-    traces = [
-        _bar("published", labels, printed, hatched),
-        _bar(f"measured here, {name}", labels, values["noc all"], {"color": colours}),
-    ]
+    traces = [] if figure is None else [_bar("published", labels, printed, hatched)]
+    traces.append(_bar(f"measured here, {name}", labels, values[region], {"color": colours}))
     widths = [x for column in (printed, *values.values()) for x in column if x is not None]
     layout = {
         "barmode": "group",
@@ -123,15 +145,15 @@ def bars(rows: Sequence[JsonRow], figure: str, name: str) -> dict[str, Any]:
         "yaxis": {"autorange": "reversed", "ticks": ""},
         "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "traceorder": "normal"},
     }
-    by_region = {region: [printed, column] for region, column in values.items()}
+    by_region = {key: [column] if figure is None else [printed, column] for key, column in values.items()}
     height = _FRAME_PX + _ROW_PX * len(labels)
-    words = {"e4": "validation figures (fig. e4)", "e5": "test figures (fig. e5)"}[figure]
-    heading = f"D1 error beside the paper's {words}"
+    words = {"e4": "validation figures (fig. e4)", "e5": "test figures (fig. e5)"}
+    heading = "D1 error" if figure is None else f"D1 error beside the paper's {words[figure]}"
     return {"data": traces, "layout": layout, "variants": {"x": by_region}, "height": height, "title": heading}
 
 
-def accuracy_time(rows: Sequence[JsonRow]) -> dict[str, Any]:
-    """Return the paper's figure 1: error against time, with ours and other libraries' on this machine."""
+def accuracy_time(rows: Sequence[JsonRow], region: str = "noc all", *, beside_paper: bool = True) -> dict[str, Any]:
+    """Return error against time on this machine, on KITTI 2015 beside the points of the paper's figure 1."""
     traces: list[dict[str, Any]] = []
     errors_by_region: dict[str, list[Any]] = {region: [] for region in REGIONS}
     variants = list(dict.fromkeys(_variant(row) for row in rows if row["setting"] != BASELINE))
@@ -146,17 +168,18 @@ def accuracy_time(rows: Sequence[JsonRow]) -> dict[str, Any]:
             continue
         marker = {"color": color, "size": 12, "symbol": symbol(variant, variants) if variant else "square"}
         labels = [row_name(row).removeprefix("OpenCV ") if not variant else row["matcher"] for row in scored]
-        x = [_d1(row, "noc all") for row in scored]
+        x = [_d1(row, region) for row in scored]
         traces.append(_points(f"{name}, this machine", x, [row["ms"]["total"] for row in scored], labels, marker))
-        for region, values in errors_by_region.items():
-            values.append([_d1(row, region) for row in scored])
-    points = published.FIGURE_1
+        for key, values in errors_by_region.items():
+            values.append([_d1(row, key) for row in scored])
+    points = published.FIGURE_1 if beside_paper else ()
     marker = {"color": "#d55e00", "size": 12, "symbol": "diamond-open", "line": {"width": 2}}
     sources = [f"{p.source}{', pixels: ' + p.pixels if p.pixels else ''}" for p in points]
     x, y = [p.d1 for p in points], [p.ms for p in points]
-    traces.append(_points("published, Jetson AGX Xavier", x, y, [p.name for p in points], marker, sources))
-    for values in errors_by_region.values():
-        values.append(x)
+    if points:
+        traces.append(_points("published, Jetson AGX Xavier", x, y, [p.name for p in points], marker, sources))
+        for values in errors_by_region.values():
+            values.append(x)
     layout = {
         "xaxis": {"title": {"text": "D1 error, %"}, "rangemode": "tozero"},
         "yaxis": {"title": {"text": "time, ms"}, "type": "log", "tickvals": _TICKS, "ticktext": _TICKS},

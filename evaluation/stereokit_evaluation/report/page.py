@@ -66,7 +66,7 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
     StereokitError
         If jinja2 or plotly is not installed.
     """
-    rows = document["results"]
+    rows, kitti = document["results"], _charts.kitti_part(document)
     title = f"{document['dataset']}{', ' + document['split'] if document['split'] else ''}"
     chosen = chosen_frames(frames, study.rows, show)
     tiles = TileFolder(path) if _pixels(chosen, study.rows) > _LARGE else None
@@ -89,11 +89,14 @@ def write_report(path: Path, document: dict[str, Any], study: Study, frames: Seq
         per_pair=per_pair(rows, [frame.name for frame in chosen], digits=3),
         methods=_first_methods(study.rows),
         regions=_charts.REGIONS,
+        region=_charts.first_region(rows),
         disturbances=document.get("disturbances") or {},
         fault_figures=FIGURE_TITLES,
         stages=(TOTAL, *GROUPS, OTHER),
         missing=missing_lines(study.rows),
         published=published,
+        kitti=kitti,
+        beside=kitti is not None and len(document["data"]) == 1,
     )
     write_bytes(path, page)
     return len(page) + (0 if tiles is None else tiles.bytes)

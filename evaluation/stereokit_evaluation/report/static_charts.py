@@ -169,7 +169,8 @@ def _draw_points(axes: Any, trace: Figure) -> list[tuple[float, float, str]]:
 def _lay_out(axes: Any, layout: Figure, bars: bool) -> None:
     for name in ("x", "y"):
         axis = layout.get(f"{name}axis", {})
-        if axis.get("type") == "log":
+        values = [value for line in axes.lines for value in getattr(line, f"get_{name}data")()]
+        if axis.get("type") == "log" and any(value > 0 for value in values):  # an axis without any cannot be
             getattr(axes, f"set_{name}scale")("log")
         if title := axis.get("title", {}).get("text"):
             getattr(axes, f"set_{name}label")(title)

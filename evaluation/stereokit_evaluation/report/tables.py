@@ -23,7 +23,11 @@ _LATEX = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
     **{character: f"\\{character}" for character in "&%$#_{}"},
+    **{character: f"{{{character}}}" for character in "[*"},  # else an argument of \\ or \midrule before it
 }
 _NONE = {"latex": "--", "markdown": "-"}
 
@@ -119,12 +123,16 @@ def study_tables(document: Mapping[str, Any]) -> dict[str, Table]:
     frames = len(document["frames"])
     part = f", {document['split']}" if document["split"] else ""
     count = f"{frames} frame{'' if frames == 1 else 's'} of {name}{part}"
+    truth = document.get("frames_with_truth") or {}
+    if truth and any(truth[region] != frames for region in ("noc", "occ")):
+        count += f" (noc: {truth['noc']} of them, occ: {truth['occ']})"
     names = (Column("matcher", None), Column("setting", None))
     regions = [(region, part) for region in ("noc", "occ") for part in ("all", "bg", "fg")]
     thresholds = list(rows[0]["bad"]["noc"]) if rows else []
     stages = (TOTAL, *GROUPS, OTHER)
     accuracy = Table(
-        f"D1 error in percent by pixels (noc: seen by both; occ: all), density in percent, EPE in pixels; {count}",
+        f"D1 error in percent by pixels (noc: seen by both; occ: all); density in percent and EPE in pixels of noc, "
+        f"of occ if no frame has noc; {count}",
         (
             *names,
             *(Column(f"D1 {region} {part}", best=True) for region, part in regions),

@@ -13,6 +13,7 @@ Each is called with a frame and its images, and returns a `stereokit.result.Disp
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import inspect
@@ -91,19 +92,35 @@ class FunctionMethod:
     kind = "function"
 
     def identity(self) -> dict[str, Any]:
-        """Return the name, the range and a digest of the source file."""
+        """Return the name, the range, and a digest of the source file and of the modules beside it that it uses."""
         try:
             file = inspect.getsourcefile(inspect.unwrap(self.function))
         except TypeError:  # an object with __call__, or a compiled function
             file = getattr(sys.modules.get(type(self.function).__module__), "__file__", None)
         place = f"{getattr(self.function, '__module__', '')}:{getattr(self.function, '__qualname__', '')}"
-        return {"function": place, "levels": self.max_disparity, "source": _digest(file)}
+        source = {
+            "source": _digest(file),
+            "modules": _modules_beside(getattr(self.function, "__module__", "") or "", file),
+        }
+        return {"function": place, "levels": self.max_disparity, **source}
 
     def __call__(self, frame: Frame, left: NDArray[Any], right: NDArray[Any]) -> Disparity:
         """Return the function's map."""
-        takes_range = _takes(self.function, "max_disparity")
-        result = self.function(left, right, **({"max_disparity": self.max_disparity} if takes_range else {}))
-        return checked_map(self.name, result, left.shape[:2])
+        return self.timed(left, right)[0]
+
+    def timed(
+        self, left: NDArray[Any], right: NDArray[Any], clock: Callable[[], float] = time.perf_counter
+    ) -> tuple[Disparity, float]:
+        """Return the map and the seconds of the call; its images are copies, so that writing to them harms no other."""
+        range_ = {"max_disparity": self.max_disparity} if _takes(self.function, "max_disparity") else {}
+        own_left, own_right = left.copy(), right.copy()
+        start = clock()
+        try:
+            result = self.function(own_left, own_right, **range_)
+        except SystemExit as error:  # a script that ends itself must not end a long run
+            raise InputError(f"{self.name} ended Python: SystemExit: {error}") from error
+        disparity = checked_map(self.name, result, left.shape[:2])
+        return disparity, clock() - start
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +263,7 @@ def outside_function(text: str, max_disparity: int) -> FunctionMethod:
             target: Any = importlib.import_module(module_name)
             for part in path.split("."):
                 target = getattr(target, part)
-    except Exception as error:  # whatever a module of others does when it is imported
+    except (Exception, SystemExit) as error:  # whatever a module of others does when it is imported
         reason = one_line(f"{type(error).__name__}: {error}")
         raise OptionError(f"method must name a function that can be imported, got {text!r}: {reason}") from error
     if not callable(target):
@@ -316,7 +333,7 @@ def named(option: str, text: str) -> tuple[str, str]:
     name, separator, value = text.partition("=")
     name, value = name.strip(), value.strip()
     if not separator or not name or not value or "/" in name:
-        raise OptionError(f"{option} must be NAME=VALUE, got {text!r}")
+        raise OptionError(f"{option} must be NAME=VALUE with no / in the name, got {text!r}")
     return name, value
 
 
@@ -431,6 +448,44 @@ def _working_folder_first() -> Iterator[None]:
         yield
     finally:
         sys.path[:] = before
+
+
+def _modules_beside(name: str, file: str | Path | None) -> dict[str, str]:
+    """Return digests of the Python files that a module imports, and they in turn, from its own folder or package.
+
+    Read from the text of ``import`` statements, wherever they stand; installed packages but its own are left out.
+    """
+    if file is None or not Path(file).is_file():
+        return {}
+    first = Path(file).resolve()
+    root = first.parents[min(name.count(".") + (first.name == "__init__.py"), len(first.parents) - 1)]
+    home = root / name.partition(".")[0] if root.name in ("site-packages", "dist-packages") else root
+    digests, waiting = {first: ""}, [first]
+    while waiting:
+        for place in _imported_files(waiting.pop(), root):
+            if place not in digests and place.is_relative_to(home):
+                digests[place] = _digest(place)
+                waiting.append(place)
+    return {place.relative_to(root).as_posix(): digest for place, digest in sorted(digests.items()) if digest}
+
+
+def _imported_files(file: Path, root: Path) -> Iterator[Path]:
+    """Yield the files that a Python file's ``import`` statements may mean, below `root` or beside it."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [root.joinpath(*alias.name.split(".")) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = file.parents[node.level - 1] if 0 < node.level <= len(file.parents) else root
+            base = base.joinpath(*(node.module or "").split("."))
+            names = [base, *(base / alias.name for alias in node.names)]
+        else:
+            continue
+        for stem in names:
+            yield from (place for place in (stem.with_name(f"{stem.name}.py"), stem / "__init__.py") if place.is_file())
 
 
 def _digest(file: str | Path | None) -> str:

@@ -22,7 +22,7 @@ from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.assessment import Official, assess
 from stereokit_evaluation.scoring.kitti import Score
 from stereokit_evaluation.scoring.measures import Measures
-from stereokit_evaluation.scoring.outside import OutsideMethod, Program, map_of
+from stereokit_evaluation.scoring.outside import FunctionMethod, OutsideMethod, Program, map_of
 
 __all__ = [
     "Estimate",
@@ -279,9 +279,12 @@ def with_outside(method: OutsideMethod) -> Estimator:
                 if not warm:
                     method(frame, left, right)
                     warm = True
-                start = time.perf_counter()
-                result = method(frame, left, right)
-                seconds = time.perf_counter() - start
+                if isinstance(method, FunctionMethod):
+                    result, seconds = method.timed(left, right)
+                else:
+                    start = time.perf_counter()
+                    result = method(frame, left, right)
+                    seconds = time.perf_counter() - start
         except (StereokitError, OSError):
             raise
         except Exception as error:  # a slip in another's method costs the frame

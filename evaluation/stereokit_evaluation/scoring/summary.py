@@ -70,7 +70,8 @@ def pixels_line(result: Result) -> str:
     rest = pairs - seen
     where = "seen by both cameras" if not rest else "all with truth, as no mask says which both cameras see"
     if rest and seen:
-        where = f"seen by both cameras in {seen} of them, all with truth in the other{'' if rest == 1 else f' {rest}'}"
+        where = f"seen by both cameras in {seen} of them, all with truth, occluded ones too, in the other"
+        where += "" if rest == 1 else f" {rest}"
     return (
         f"Figures count {measures.main.pixels:,} pixels of {pairs} pair{'' if pairs == 1 else 's'} ({where}) on maps "
         f"filled as by KITTI; A90, A95: means of the pairs' quantiles; occluded: {measures.occluded.pixels:,} pixels; "

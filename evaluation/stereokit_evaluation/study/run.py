@@ -31,7 +31,7 @@ from stereokit_evaluation.data import frame as frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring import assessment, eth3d, kitti, measures, middlebury
 from stereokit_evaluation.scoring.assessment import assess
-from stereokit_evaluation.scoring.outside import Program
+from stereokit_evaluation.scoring.outside import FunctionMethod, Program
 from stereokit_evaluation.scoring.runner import Result, Scored, Skipped
 from stereokit_evaluation.study.configurations import BASELINE, Configuration, describe_error, fingerprint, title
 from stereokit_evaluation.study.store import Record, Store, digest, frame_digest
@@ -267,6 +267,10 @@ def measure(
             configuration.match(frame, left, right)
         for _ in range(repeats):
             timer = StageTimer(clock, groups=True)
+            if isinstance(outside, FunctionMethod):
+                result, seconds = outside.timed(left, right, clock)
+                runs.append({TOTAL: seconds})
+                continue
             if configuration.variant == BASELINE:
                 start = clock()
                 result = configuration.match(frame, left, right)

@@ -41,9 +41,14 @@ _FEW_SCENES = 6
 _SHOWN = ("bad-0.5", "bad-1", "bad-2", "bad-4", "epe", "rmse", "a90", "a95", "density")
 
 
-def published_values(row: StudyRow) -> dict[str, float | None]:
-    """Return the paper's figures for one row: percent by fig. e4 and e5, milliseconds by table II."""
+def published_values(row: StudyRow, dataset: str | None) -> dict[str, float | None]:
+    """Return the paper's figures for one row: percent by fig. e4 and e5, milliseconds by table II.
+
+    They are of KITTI 2015: beside another `dataset` all are None.
+    """
     label, variant = row.configuration.label, row.configuration.variant
+    if dataset != "kitti2015":
+        return {"validation_d1": None, "test_d1_noc": None, "agx_ms": None}
     return {
         "validation_d1": published.VALIDATION.get(label, {}).get(variant),
         "test_d1_noc": published.TEST.get(label, {}).get(variant),
@@ -51,8 +56,15 @@ def published_values(row: StudyRow) -> dict[str, float | None]:
     }
 
 
-def as_json(study: Study) -> dict[str, Any]:
-    """Return all rows with the published values; scores are None where nothing was scored."""
+def as_json(study: Study, dataset: str | None) -> dict[str, Any]:
+    """Return all rows, with published values for KITTI 2015; scores are None where nothing was scored.
+
+    Parameters
+    ----------
+    study : Study
+    dataset : str or None
+        Name of its data set; None for several.
+    """
     return {
         "results": [
             {
@@ -71,7 +83,7 @@ def as_json(study: Study) -> dict[str, Any]:
                 **summary(row.result),
                 "intervals": intervals(row),
                 "ms": row.ms,
-                "published": published_values(row),
+                "published": published_values(row, dataset),
             }
             for row in study.rows
         ],
@@ -125,11 +137,11 @@ def missing_lines(rows: Sequence[StudyRow]) -> list[str]:
     ]
 
 
-def print_tables(heading: str, study: Study, note: str) -> None:
+def print_tables(heading: str, study: Study, note: str, dataset: str) -> None:
     """Print accuracy, then times, then the missing variants."""
     console = _console()
-    _print_whole(console, _accuracy(heading, study.rows))
-    _print_whole(console, _times(study.rows))
+    _print_whole(console, _accuracy(heading, study.rows, dataset))
+    _print_whole(console, _times(study.rows, dataset))
     for line in (*missing_lines(study.rows), note):
         console.print(line, markup=False, highlight=False)
 
@@ -291,7 +303,7 @@ def _scenes_line(study: Study) -> str:
     frames = _frames(study)
     scenes, pairs = len(scene_names(frames)), f"{len(frames)} pair{'' if len(frames) == 1 else 's'}"
     if scenes == 1:
-        return f"Intervals and p: none, as the {pairs} show one scene."
+        return f"Intervals and p: none, as there is one scene ({pairs})."
     line = f"Intervals: {DRAWS} bootstrap draws of {scenes} scenes ({pairs}); p: exchanges of the two methods by scene."
     if scenes < _FEW_SCENES:
         line += f" So few scenes say little: intervals are too narrow, and p cannot be below {2 / 2**scenes:.2g}."
@@ -318,42 +330,41 @@ def _head(figure: str) -> str:
     return figure.upper() if figure[0] in "adre" and figure != "density" else figure
 
 
-def _accuracy(heading: str, rows: Sequence[StudyRow]) -> Table:
-    table = _table(f"{heading}: D1 in percent, EPE in pixels")
-    heads = (*(f"{region} {part}" for region, part in _D1), "density", "EPE", "published e4", "published e5, noc")
+def _accuracy(heading: str, rows: Sequence[StudyRow], dataset: str) -> Table:
+    table = _table(f"{heading}: D1 in percent, EPE in pixels; density, EPE: noc if any")
+    paper_heads = ("published e4", "published e5, noc") if dataset == "kitti2015" else ()
+    heads = (*(f"{region} {part}" for region, part in _D1), "density", "EPE", *paper_heads)
     for head in heads:
         table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
     for index, row in enumerate(rows):
         scores = summary(row.result)
-        paper = published_values(row)
+        paper = published_values(row, dataset)
         cells = [scores["d1"][region][part] for region, part in _D1]
         table.add_row(
             *_names(row),
             *(_figure(cell) for cell in cells),
             _figure(scores["density"], 1),
             _figure(scores["epe"]),
-            _figure(paper["validation_d1"]),
-            _figure(paper["test_d1_noc"]),
+            *(_figure(paper[name]) for name in ("validation_d1", "test_d1_noc")[: len(paper_heads)]),
             end_section=_ends(rows, index),
         )
     return table
 
 
-def _times(rows: Sequence[StudyRow]) -> Table:
+def _times(rows: Sequence[StudyRow], dataset: str) -> Table:
     table = _table("milliseconds a frame: medians, after a call to warm up")
-    for head in (TOTAL, *GROUPS, OTHER, "published, AGX Xavier"):
+    paper_heads = ("published, AGX Xavier",) if dataset == "kitti2015" else ()
+    for head in (TOTAL, *GROUPS, OTHER, *paper_heads):
         table.add_column(head, justify="right", style="italic" if head.startswith("published") else None)
     for index, row in enumerate(rows):
         cells = (row.ms.get(name) for name in (TOTAL, *GROUPS, OTHER))
-        paper_ms = published_values(row)["agx_ms"]
-        table.add_row(
-            *_names(row), *(_figure(cell, 1) for cell in cells), _figure(paper_ms), end_section=_ends(rows, index)
-        )
+        paper = [_figure(published_values(row, dataset)["agx_ms"])] if paper_heads else []
+        table.add_row(*_names(row), *(_figure(cell, 1) for cell in cells), *paper, end_section=_ends(rows, index))
     return table
 
 
 def _console() -> Console:
-    return Console(width=None if sys.stdout.isatty() else _WIDTH)
+    return Console(width=None if sys.stdout.isatty() else _WIDTH, emoji=False)
 
 
 def _print_whole(console: Console, table: Table) -> None:

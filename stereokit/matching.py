@@ -47,7 +47,7 @@ class Matcher:
     Parameters
     ----------
     method : str
-        ``"cost+aggregation"`` or S1 to S4, any case; the default, S2, is the fastest and most accurate of the four.
+        ``"cost+aggregation"`` or S1 to S4, any case; the default, S2, is the most accurate of the four.
     max_disparity, min_disparity : int
         Disparities ``min_disparity <= d < max_disparity`` are searched, in full-size pixels. The minimum may be
         negative. 1 to 2048 levels.

@@ -260,7 +260,7 @@ MUTANTS = [
     ),
     Mutant(
         "the up sweep looks at the row above", "aggregation.paths.narrow",
-        "here - step * width", "here - width", _RULE, "narrow",
+        "before = y - step", "before = y - 1", _RULE, "narrow",
     ),
     Mutant(
         "diagonal paths have the start of the pixel above", "aggregation.paths.narrow",

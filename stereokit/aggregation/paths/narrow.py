@@ -174,7 +174,7 @@ def first_narrow_visit(
     for k in range(abs(y1 - y0)):
         y = y0 + k * step
         here = y * width
-        before = here if k == 0 else here - step * width
+        before = _row_before(buffers, guide, y, step)
         _narrow_costs(rows, buffers, y, 0)
         write_penalties(guide, y, step, len(buffers.paths.diagonals) > 0, False, penalties, 0, buffers.paths.penalties)
         bypass = (abs(y1 - y0) - k) * width * LANES > near

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stereokit.errors import InputError
-from stereokit_evaluation.scoring.measures import QUANTILES, error_quantiles
+from stereokit_evaluation.scoring.measures import QUANTILES, counted_pixels, error_quantiles
 
 __all__ = ["THRESHOLDS", "average", "score_pair"]
 
@@ -57,12 +57,7 @@ def score_pair(estimate: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
     disparity, reference = np.asarray(estimate, np.float32), np.asarray(truth, np.float32)
     if disparity.ndim != 2 or disparity.shape != reference.shape:
         raise InputError(f"truth must have the size of the map, {disparity.shape}, got {reference.shape}")
-    counts = np.isfinite(reference)
-    if mask is not None:
-        chosen = np.asarray(mask)
-        if chosen.shape != reference.shape:
-            raise InputError(f"mask must have the size of the truth, {reference.shape}, got {chosen.shape}")
-        counts &= chosen.astype(bool)
+    counts = counted_pixels(reference, mask)
     pixels = int(np.count_nonzero(counts))
     if not pixels:
         return None

@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereokit.errors import InputError
 from stereokit_evaluation.scoring.kitti import THRESHOLDS, fill_background, outliers
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "Errors",
     "Figure",
     "Measures",
+    "counted_pixels",
     "error_quantiles",
     "errors_of",
     "measure_map",
@@ -179,6 +181,29 @@ class Measures:
 
     def __add__(self, other: Measures) -> Measures:
         return Measures(*(getattr(self, name) + getattr(other, name) for name in SETS))
+
+
+def counted_pixels(truth: NDArray[np.float32], mask: ArrayLike | None) -> NDArray[np.bool_]:
+    """Return where there is truth and a mask does not exclude a pixel: (H, W) bool.
+
+    Parameters
+    ----------
+    truth : (H, W) float32, pixels, not finite where unknown
+    mask : (H, W) or None
+        Not 0 where a pixel counts; None for all.
+
+    Raises
+    ------
+    InputError
+        If the mask has another size.
+    """
+    counts: NDArray[np.bool_] = np.isfinite(truth)
+    if mask is not None:
+        chosen = np.asarray(mask)
+        if chosen.shape != truth.shape:
+            raise InputError(f"mask must have the size of the truth, {truth.shape}, got {chosen.shape}")
+        counts &= chosen.astype(bool)
+    return counts
 
 
 def error_quantiles(errors: NDArray[np.float32]) -> tuple[float, ...]:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereokit.errors import InputError
-from stereokit_evaluation.scoring.measures import QUANTILES, error_quantiles
+from stereokit_evaluation.scoring.measures import QUANTILES, counted_pixels, error_quantiles
 
 __all__ = ["FULL_WIDTHS", "THRESHOLDS", "WEIGHTS", "relative_size", "score_pair", "weighted_average"]
 
@@ -101,12 +101,7 @@ def score_pair(
     scale = reference.shape[1] // max(disparity.shape[1], 1)
     if scale not in (1, 2, 4) or tuple(scale * side for side in disparity.shape) != reference.shape:
         raise InputError(f"truth must be 1, 2 or 4 times as large as the map, {disparity.shape}, got {reference.shape}")
-    counts = np.isfinite(reference)
-    if mask is not None:
-        chosen = np.asarray(mask)
-        if chosen.shape != reference.shape:
-            raise InputError(f"mask must have the size of the truth, {reference.shape}, got {chosen.shape}")
-        counts &= chosen.astype(bool)
+    counts = counted_pixels(reference, mask)
     pixels = int(np.count_nonzero(counts))
     if not pixels:
         return None

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-KERNEL_TESTS := sgm dt costs wta postprocess simd properties
+KERNEL_TESTS := sgm dt costs wta postprocess simd properties search
 
 define MATCH_A_PAIR
 import sys, cv2, numpy as np, stereokit

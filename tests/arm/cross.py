@@ -18,8 +18,24 @@ import re
 import sys
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
 
-TRIPLE = "aarch64-unknown-linux-gnu"
+
+
+class Processor(NamedTuple):
+    """What to compile for, and which processor of qemu runs it."""
+
+    triple: str
+    name: str  # LLVM's
+    bits: int  # of the widest vectors
+    emulated: str
+
+
+PROCESSORS = {
+    "neon": Processor("aarch64-unknown-linux-gnu", "generic", 128, "cortex-a72"),
+    "avx2": Processor("x86_64-unknown-linux-gnu", "haswell", 256, "Haswell"),
+}
 METHODS = ("S2", "S3")
 HOT = ("first_visit", "_last_visit", "_produce_rows", "_filter_band", "_census_row", "_zncc_row", "select_row")
 """Kernels that a frame's time goes to, by the name of their function."""
@@ -61,21 +77,34 @@ def record(path: str) -> None:
     Path(path).write_bytes(dumps(signatures))
 
 
-def count(signatures: str, out: str) -> None:
-    """Compile for ARM and write how often each kind of instruction stands in a kernel's code."""
-    os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = "generic", ""
+def pretend(processor: str) -> None:
+    """Let numba compile for a processor, and the package take it for this one; before either is imported.
+
+    Raises RuntimeError where LLVM cannot.
+    """
+    triple, name, bits, _ = PROCESSORS[processor]
+    os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = name, ""
     import llvmlite.binding as binding
     from llvmlite.binding import targets
 
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
-    binding.get_process_triple = targets.get_process_triple = lambda: TRIPLE
+    binding.get_process_triple = targets.get_process_triple = lambda: triple
+    binding.Target.from_triple(triple)
+    binding.Target.from_default_triple = classmethod(lambda cls: cls.from_triple(triple))
+    from stereokit.kernels.simd import arithmetic
+
+    arithmetic.vector_bits = lambda: bits
+    arithmetic.config = SimpleNamespace(CPU_NAME=None)  # named, it would count as one that has 128 bits
+
+
+def count(signatures: str, out: str) -> None:
+    """Compile for ARM and write how often each kind of instruction stands in a kernel's code."""
     try:
-        binding.Target.from_triple(TRIPLE)
+        pretend("neon")
     except RuntimeError as error:
         Path(out).write_text(json.dumps({"missing": str(error)}), encoding="utf-8")
         return
-    binding.Target.from_default_triple = classmethod(lambda cls: cls.from_triple(TRIPLE))
     import stereokit.matching  # noqa: F401 (its types come before the signatures)
 
     table = {}

@@ -11,9 +11,10 @@ multiplied into the left pixel, not into the products. Only the two last factors
 the product of the three is rounded once to `steps` levels.
 
 Sums slide: those of the columns take one row in and one out, and a window's is the difference of two sums over all
-columns up to one, so the work per cell does not grow with the window. (These wrap; their difference does not.) The right pixels of the row that comes and of the one that goes
-lie side by side in one 32-bit lane, and so do their left factors, ``n * new`` and ``-n * old``: one instruction
-(`add_pairs`) makes what a column gains, and with the window's own sums in such lanes, what the numerator loses.
+columns up to one, so the work per cell does not grow with the window. (These wrap; their difference does not.) The
+right pixels of the row that comes and of the one that goes make pairs, and so do their left factors, ``n * new`` and
+``-n * old``. Where one instruction multiplies pairs and adds the two products, they lie side by side in one 32-bit
+lane (`add_pairs`), and the window's own sums in such lanes, for what the numerator loses.
 
 Bound and measurement for 64 cells (512-bit vectors): column sums are read twice and written once, and the right
 image's pairs, sums and factors are read once, at any alignment: 8 aligned loads at 0.29 ns, 12 others at 0.44 ns and
@@ -40,6 +41,7 @@ from stereokit.kernels.simd import (
     LANES,
     PART,
     add,
+    add_firsts,
     add_pairs,
     add_scaled,
     bits_of,
@@ -87,7 +89,9 @@ class ColumnSums(NamedTuple):
     """Sums of products over the columns of the windows around one row, which slide with it; of one worker."""
 
     row: NDArray[np.int64]  # (1,): that row, or -1
-    sums: NDArray[np.int32]  # n times those of columns 0 .. c together, element ((d // 64) * (C + 1) + c + 1) * 64 + d % 64
+    sums: NDArray[
+        np.int32
+    ]  # n times those of columns 0 .. c together, element ((d // 64) * (C + 1) + c + 1) * 64 + d % 64
     factors: NDArray[np.int32]  # n * left pixels of the row that comes (low half), -n * those of the one that goes
     pairs: NDArray[np.int32]  # right pixels of the row that comes and of the one that goes, as of `store_pair`
 
@@ -333,12 +337,14 @@ def _write_pairs(rows: ZnccRows, place: int, low_row: int, high_row: int, low_n:
         store_pair(rows.columns.pairs, at, images.right_stride, k, images.right[new + k], images.right[old + k])
     new = max(low_row, 0) * images.left_stride
     old = max(high_row, 0) * images.left_stride
-    at = place * images.left_stride
-    n_low = low_n if low_row >= 0 else 0
-    n_high = high_n << 16 if high_row >= 0 else 0
+    factors = rows.columns.factors[place * images.left_stride : (place + 1) * images.left_stride]
+    n_low = np.int32(low_n if low_row >= 0 else 0)
+    n_high = np.int32(high_n << 16 if high_row >= 0 else 0)
     for c in range(images.left_stride):
-        factors = (n_low * np.int64(images.left[new + c]) & 0xFFFF) + n_high * np.int64(images.left[old + c])
-        rows.columns.factors[at + c] = np.int32(factors)  # cut once at the end: LLVM then works with 32 bits throughout
+        # Numba multiplies 64 bits; as they are cut once, at the end, LLVM makes it 32, and vectors.
+        low = np.int64(n_low) * np.int64(images.left[new + c]) & 0xFFFF
+        high = np.int64(n_high) * np.int64(images.left[old + c])
+        factors[c] = np.int32(low + high)
 
 
 @inline
@@ -503,14 +509,25 @@ def _add_pair(sums: Any, lane: int, pair: _NarrowPair) -> Any:
 
 
 @inline
+def _add_last_row(sums: Any, lane: int, pair: _NarrowPair) -> Any:
+    """Add the products of the last row of a window, whose pair has no second row."""
+    pairs = load_pairs(pair.rows.columns.pairs, pair.start, pair.rows.images.right_stride, pair.k + lane)
+    return add_firsts(sums, pairs, pair.factors)
+
+
+@inline
+def _narrow_pair(rows: ZnccRows, pair: int, c: int, start: int) -> _NarrowPair:
+    images = rows.images
+    factors = splat_pair_at(rows.columns.factors, pair * images.left_stride + c)
+    return _NarrowPair(rows, pair * images.right_stride, images.left_stride - 1 - c + start, factors)
+
+
+@inline
 def _add_column(rows: ZnccRows, sums: Any, c: int, start: int) -> Any:
     """Add n times the products of padded column `c` of the window, for the levels from `start` on."""
-    images = rows.images
-    for pair in range(rows.half + 1):
-        factors = splat_pair_at(rows.columns.factors, pair * images.left_stride + c)
-        k = images.left_stride - 1 - c + start
-        sums = each_part(_add_pair, sums, 0, _NarrowPair(rows, pair * images.right_stride, k, factors))
-    return sums
+    for pair in range(rows.half):
+        sums = each_part(_add_pair, sums, 0, _narrow_pair(rows, pair, c, start))
+    return each_part(_add_last_row, sums, 0, _narrow_pair(rows, rows.half, c, start))
 
 
 class _Place(NamedTuple):

@@ -1,11 +1,11 @@
-"""Compile the kernels of two methods for 64-bit ARM, on any machine, and count what their machine code does.
+"""Compile the kernels of some methods for 64-bit ARM, on any machine, and count what their machine code does.
 
 Two steps, each in a process of its own, since numba decides for a processor when it is imported:
 
     python cross.py record SIGNATURES           match a small pair, and keep what types the kernels were called with
     python cross.py count SIGNATURES COUNTS     compile for these types, without running anything
 
-S2 and S3 have every hot kernel between them: both costs, both aggregations, the selection.
+The methods have every hot kernel between them: both costs, both aggregations, the selection, both searches.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 
-
 class Processor(NamedTuple):
     """What to compile for, and which processor of qemu runs it."""
 
@@ -36,8 +35,11 @@ PROCESSORS = {
     "neon": Processor("aarch64-unknown-linux-gnu", "generic", 128, "cortex-a72"),
     "avx2": Processor("x86_64-unknown-linux-gnu", "haswell", 256, "Haswell"),
 }
-METHODS = ("S2", "S3")
-HOT = ("first_visit", "_last_visit", "_produce_rows", "_filter_band", "_census_row", "_zncc_row", "select_row")
+METHODS = (("S2", "full"), ("S3", "full"), ("S2", "coarse-to-fine"), ("S4", "coarse-to-fine"))
+HOT = (
+    "first_visit", "_last_visit", "_produce_rows", "_filter_band", "_census_row", "_zncc_row", "select_row",
+    "first_narrow_visit", "_last_narrow_visit", "_narrow_census_row", "_narrow_zncc_row",
+)  # fmt: skip
 """Kernels that a frame's time goes to, by the name of their function."""
 
 KINDS = {
@@ -66,8 +68,8 @@ def record(path: str) -> None:
     import stereokit
 
     image = np.random.default_rng(0).integers(0, 256, (24, 80), dtype=np.uint8)
-    for method in METHODS:
-        stereokit.Matcher(method, max_disparity=128, threads=1)(image, image)
+    for method, search in METHODS:
+        stereokit.Matcher(method, max_disparity=128, search=search, threads=1)(image, image)
     signatures = {}
     for name, module in sorted(sys.modules.items()):
         for key in HOT:
@@ -123,7 +125,47 @@ def counted(text: str) -> dict[str, int]:
     counts = Counter({kind: 0 for kind in KINDS})
     for line in lines:
         counts.update(kind for kind, pattern in KINDS.items() if re.match(pattern, line))
-    return dict(counts)
+    return {**counts, "loop": largest_loop(text)}
+
+
+def largest_loop(text: str) -> int:
+    """Return the number of instructions of the largest loop that has no loop in it, each counted once."""
+    sizes, after, places = [0], [[]], {}
+    falls = [True]
+    for line in text.splitlines():
+        if label := re.match(r"(\.?\w+):", line):
+            places[label[1]] = len(sizes)
+        elif not line.startswith("\t") or line.startswith("\t."):
+            continue
+        else:
+            sizes[-1] += 1
+            branch = re.match(r"\t(b|b\.\w+|cbn?z|tbn?z|ret|br)\b(?:.*\s(\.LBB\w+))?", line)
+            if branch is None:
+                continue
+            after[-1] += [branch[2]] if branch[2] else []
+            falls[-1] = branch[1] not in ("b", "br", "ret")
+        sizes.append(0)
+        after.append([])
+        falls.append(True)
+    follow = [
+        {places[label] for label in after[n] if label in places}
+        | ({n + 1} if falls[n] and n + 1 < len(sizes) else set())
+        for n in range(len(sizes))
+    ]
+    before: list[set[int]] = [set() for _ in sizes]
+    for n, targets in enumerate(follow):
+        for target in targets:
+            before[target].add(n)
+    loops: dict[int, set[int]] = {}
+    for last, heads in enumerate(follow):
+        for head in (head for head in heads if head <= last):
+            body = loops.setdefault(head, {head})
+            waiting = {last} - body
+            while waiting:
+                body |= waiting
+                waiting = set().union(*(before[n] for n in waiting)) - body
+    inner = [body for head, body in loops.items() if not any(other in body for other in loops if other != head)]
+    return max((sum(sizes[n] for n in body) for body in inner), default=0)
 
 
 if __name__ == "__main__":

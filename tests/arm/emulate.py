@@ -1,13 +1,14 @@
-"""Run single kernels, compiled for another processor, under qemu-user: are their bits the same, how much do they execute?
+"""Run single kernels under qemu-user, compiled for another processor: compare their bits, count what they execute.
 
-Three steps, each in a process of its own, since numba decides for a processor when it is imported:
+Steps, each in a process of its own, since numba decides for a processor when it is imported:
 
     python emulate.py record FOLDER               match small pairs; keep what the hot kernels were given and made of it
     python emulate.py compile FOLDER PROCESSOR    object files of them, PROCESSOR as in `cross.PROCESSORS`
-    python emulate.py run FOLDER PROCESSOR        link, run, compare and count; a table, and RESULT.json in the folder
+    python emulate.py run FOLDER PROCESSOR        link, run, compare and count; prints a table
+    python emulate.py write FOLDER                put the counts of both processors into executed.json
 
-The last step needs ``qemu-user`` and, for ARM, ``gcc-aarch64-linux-gnu`` (packages of Debian). An emulated
-processor has no clock worth reading: instructions are counted, by a plugin of qemu, never times.
+`run` needs ``qemu-user`` and, for ARM, ``gcc-aarch64-linux-gnu`` (packages of
+Debian). An emulated processor has no clock worth reading: instructions are counted, by a plugin of qemu, never times.
 
 What is counted is the second of two calls less the first, which differ in the rows that they take, by the
 vectors of 64 cells that lie between: what a call does once drops out. A cost row is called once, for a row that follows
@@ -18,7 +19,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import pickle
 import re
 import subprocess
@@ -180,11 +180,11 @@ def compile_(folder: Path, processor: str, only: str = "") -> None:
             done[key] = f"{len(done)}"
             library._ensure_finalized()
             machine = library.codegen._tm
-            (folder / f"{processor}.{done[key]}.o").write_bytes(machine.emit_object(library._final_module))
-        else:
-            kernel = getattr(importlib.import_module(case["module"]), case["kernel"])
-            overload = kernel.overloads[case["kinds"]]
-        entries[name] = done[key], overload.fndesc.mangled_name
+            (folder / f"{done[key]}.{processor}.o").write_bytes(machine.emit_object(library._final_module))
+        kernel = getattr(importlib.import_module(case["module"]), case["kernel"])
+        overload = kernel.overloads[case["kinds"]]
+        loop = cross.largest_loop(overload.library.get_asm_str())
+        entries[name] = done[key], overload.fndesc.mangled_name, loop
     (folder / f"{processor}.json").write_text(json.dumps(entries), encoding="utf-8")
 
 
@@ -238,7 +238,7 @@ def build(folder: Path, processor: str, name: str, case: dict[str, Any], number:
     Path(f"{stem}.expected").write_bytes(b"".join(case["after"][place] for place in whole))
     compiler = COMPILERS[cross.PROCESSORS[processor].triple.split("-")[0]]
     command = [compiler, "-O1", "-static", "-Wl,--unresolved-symbols=ignore-all", f"{stem}.c"]
-    subprocess.run([*command, str(folder / f"{processor}.{number}.o"), "-lm", "-o", str(stem)], check=True)
+    subprocess.run([*command, str(folder / f"{number}.{processor}.o"), "-lm", "-o", str(stem)], check=True)
     return stem
 
 
@@ -310,12 +310,12 @@ def extent(stem: Path, entry: str) -> tuple[int, int]:
     return symbols[mine[0]][0], symbols[mine[-1] + 1][0]
 
 
-def run(folder: Path, processor: str, only: str = "") -> dict[str, Any]:
-    """Link, run, compare and count the cases; print and return a table."""
+def run(folder: Path, processor: str, only: str = "") -> None:
+    """Link, run, compare and count the cases; print a table."""
     cases = pickle.loads((folder / "cases").read_bytes())
     entries = json.loads((folder / f"{processor}.json").read_text(encoding="utf-8"))
     totals: dict[str, tuple[bool, int, int]] = {}
-    for name, (number, entry) in entries.items():
+    for name, (number, entry, _) in entries.items():
         if not re.search(only, name):
             continue
         stem = build(folder, processor, name, cases[name], number, entry)
@@ -332,10 +332,24 @@ def run(folder: Path, processor: str, only: str = "") -> dict[str, Any]:
     for name, (same, per_vector) in table.items():
         print(f"{processor:8} {name:28} {'same bits' if same else 'OTHER BITS':10} {per_vector:8.1f}", flush=True)
     (folder / f"{processor}.result.json").write_text(json.dumps(table), encoding="utf-8")
-    return table
+    if not all(same for same, _ in table.values()):
+        raise SystemExit("kernels gave other bits")
+
+
+def write(folder: Path) -> None:
+    """Write what kernels execute, and the sizes of their largest loops on ARM, beside this file."""
+    neon, avx2 = (json.loads((folder / f"{name}.result.json").read_text(encoding="utf-8")) for name in ("neon", "avx2"))
+    entries = json.loads((folder / "neon.json").read_text(encoding="utf-8"))
+    lines = []
+    for name, (_, count) in neon.items():
+        case = name if name in entries else f"{HEIGHTS[1]}.".join((name.split(".")[0] + ".", name.split(".")[1]))
+        table = {"neon": round(count, 1), "avx2": round(avx2[name][1], 1), "loop": entries[case][2]}
+        lines.append(f" {json.dumps(name)}: {json.dumps(table)}")
+    text = "{\n" + ",\n".join(lines) + "\n}\n"
+    Path(__file__).with_name("executed.json").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
     step, place, *rest = sys.argv[1:]
     Path(place).mkdir(exist_ok=True)
-    {"record": record, "compile": compile_, "run": run}[step](Path(place), *rest)
+    {"record": record, "compile": compile_, "run": run, "write": write}[step](Path(place), *rest)

@@ -184,6 +184,11 @@ def add_pairs(total: Lanes, pairs: Lanes, factors: Lanes) -> Lanes:
     return Lanes(total.values + low[0] * low[1] + high[0] * high[1])
 
 
+def add_firsts(total: Lanes, pairs: Lanes, factors: Lanes) -> Lanes:
+    assert (factors.values >> 16 == 0).all()
+    return add_pairs(total, pairs, factors)
+
+
 def add_scaled(total: Lanes, a: Lanes, b: Lanes) -> Lanes:
     return Lanes(total.values + a.values * (b.values << 16 >> 16))
 

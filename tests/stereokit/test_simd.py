@@ -178,7 +178,9 @@ def test_high_words_of_doubled_products_round_down(run):
 @inline
 def _add_pair(total, lane, context):
     pairs, start, count, factors, k = context
-    return simd.add_pairs(total, simd.load_pairs(pairs, start, count, 3 + lane), simd.splat_pair_at(factors, k))
+    words = simd.load_pairs(pairs, start, count, 3 + lane)
+    total = simd.add_pairs(total, words, simd.splat_pair_at(factors, k))
+    return simd.add_firsts(total, words, simd.splat_pair_at(factors, k + 1))
 
 
 @inline
@@ -197,14 +199,14 @@ def _pairs(first, second, start, pairs, factors, k, out):
 
 
 @pytest.mark.parametrize("start", [0, 5])
-@pytest.mark.parametrize("factor", [(2**15 - 1, -1), (-(2**15), 0), (3, -(2**15)), (-(2**15), -(2**15)), (-7, 2**15 - 1)])
+@pytest.mark.parametrize("factor", [(2**15 - 1, -1), (-(2**15), 0), (3, -(2**15)), (-(2**15), -(2**15)), (-7, 9)])
 def test_pairs_of_words_are_multiplied_and_added(run, start, factor):
     first, second = (np.resize(integers(np.int16, seed), 3 + COUNT + 2) for seed in (0, 1))
     pairs = np.full(start + first.size + 1, 77, np.int32)
-    factors = np.array([1, wrap((factor[0] & 0xFFFF) | (factor[1] << 16), np.int32)], np.int32)
+    factors = np.array([1, wrap((factor[0] & 0xFFFF) | (factor[1] << 16), np.int32), -5 & 0xFFFF], np.int32)
     out = np.empty(COUNT, np.int32)
     run(_pairs, first, second, start, pairs, factors, 1, out)
-    expected = loop(lambda x, y: 1 + x * factor[0] + y * factor[1], first[3:-2], second[3:-2], dtype=np.int32)
+    expected = loop(lambda x, y: 1 + x * (factor[0] - 5) + y * factor[1], first[3:-2], second[3:-2], dtype=np.int32)
     np.testing.assert_array_equal(out, expected)
     assert (pairs[:start] == 77).all() and pairs[-1] == 77
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from stereokit.kernels.simd.arithmetic import (
     add,
+    add_firsts,
     add_pairs,
     add_saturated,
     add_scaled,
@@ -70,6 +71,7 @@ __all__ = [
     "PART",
     "Vector",
     "add",
+    "add_firsts",
     "add_pairs",
     "add_saturated",
     "add_scaled",

@@ -10,10 +10,22 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from stereokit.kernels.simd.shuffle import low_bytes_ir
-from stereokit.kernels.simd.types import I32, LANES, PAIRED, Vector, call_ir, lanes_ir, on_arm, on_x86, splat_ir, vector_bits
+from stereokit.kernels.simd.types import (
+    I32,
+    LANES,
+    PAIRED,
+    Vector,
+    call_ir,
+    lanes_ir,
+    on_arm,
+    on_x86,
+    splat_ir,
+    vector_bits,
+)
 
 __all__ = [
     "add",
+    "add_firsts",
     "add_pairs",
     "add_saturated",
     "add_scaled",
@@ -200,25 +212,39 @@ def _pairs_on_x86(builder: Any, x: Any, y: Any) -> Any:
     return _by_parts(builder, pairs, bits // 32, x, y)
 
 
-@intrinsic
-def add_pairs(typing: Any, total: Any, pairs: Any, factors: Any) -> Any:
+def _add_products(name: str, doc: str, of: slice) -> Any:
+    def define(typing: Any, total: Any, pairs: Any, factors: Any) -> Any:
+        if total.scalar != types.int32 or factors != pairs:
+            return None
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            total, pairs, factors = args
+            if PAIRED:
+                return builder.add(total, _pairs_on_x86(builder, pairs, factors))
+            # One instruction multiplies words and adds the products, each of the pair's own.
+            words = [cgutils.unpack_tuple(builder, parts)[of] for parts in (pairs, factors)]
+            for pair in zip(*words, strict=True):
+                total = builder.add(total, builder.mul(*(builder.sext(word, total.type) for word in pair)))
+            return total
+
+        return total(total, pairs, factors), generate
+
+    define.__name__ = name
+    define.__doc__ = doc
+    return intrinsic(define)
+
+
+add_pairs = _add_products(
+    "add_pairs",
     """Return `total`, ``int32``, with both products of each pair of ``int16`` added, wrapping.
 
     `pairs` come from `load_pairs`, `factors` from `splat_pair_at`.
-    """
-    if total.scalar != types.int32 or factors != pairs:
-        return None
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        total, pairs, factors = args
-        if PAIRED:
-            return builder.add(total, _pairs_on_x86(builder, pairs, factors))
-        # One instruction multiplies words and adds the products, each of the pair's own.
-        for words in zip(*(cgutils.unpack_tuple(builder, parts) for parts in (pairs, factors)), strict=True):
-            total = builder.add(total, builder.mul(*(builder.sext(word, total.type) for word in words)))
-        return total
-
-    return total(total, pairs, factors), generate
+    """,
+    slice(2),
+)
+add_firsts = _add_products(
+    "add_firsts", "Return what `add_pairs` does where the second of the `factors` is 0: fewer products.", slice(1)
+)
 
 
 @intrinsic
@@ -284,7 +310,7 @@ def mask_equal(typing: Any, a: Any, b: Any) -> Any:
         parts = [lanes_ir(builder, marks, marks, range(at, at + 16)) for at in range(0, LANES, 16)]
         while parts[0].type == half and len(parts) > 1:
             pairs = zip(parts[::2], parts[1::2], strict=True)
-            parts = [call_ir(builder, "llvm.aarch64.neon.addp.v16i8", half, pair) for pair in pairs]
+            parts = [call_ir(builder, "llvm.aarch64.neon.addp.v16i8", half, list(pair)) for pair in pairs]
         mask = call_ir(builder, "llvm.aarch64.neon.addp.v16i8", half, [parts[0], parts[0]])
         return builder.extract_element(builder.bitcast(mask, ir.VectorType(ir.IntType(64), 2)), ir.Constant(I32, 0))
 

@@ -158,7 +158,9 @@ def store_pair(typing: Any, array: Any, start: Any, count: Any, k: Any, first: A
             high = builder.shl(builder.zext(second, I32), ir.Constant(I32, 16))
             builder.store(builder.or_(low, high), _element(context, builder, kind, array, builder.add(start, k), 1))
         else:
-            for word, to in zip((first, second), _words(context, builder, kind, array, start, count, k, 1), strict=True):
+            for word, to in zip(
+                (first, second), _words(context, builder, kind, array, start, count, k, 1), strict=True
+            ):
                 builder.store(word, to, align=2)
         return context.get_dummy_value()
 
@@ -185,7 +187,7 @@ def load_pairs(typing: Any, array: Any, start: Any, count: Any, k: Any) -> Any:
 
 @intrinsic
 def splat_pair_at(typing: Any, array: Any, offset: Any) -> Any:
-    """Return `PART` pairs that are all the one in element `offset` of the flat ``int32`` `array`, its low half first."""
+    """Return `PART` pairs that are all the one in element `offset` of an ``int32`` `array`, its low half first."""
     word = Vector(types.int16, PART)
     result = Vector(types.int32, PART) if PAIRED else types.UniTuple(word, 2)
 

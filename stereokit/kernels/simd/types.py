@@ -10,11 +10,22 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import models, register_model
 
-__all__ = ["I32", "LANES", "PAIRED", "PART", "Vector", "call_ir", "lanes_ir", "on_arm", "on_x86", "splat_ir", "vector_bits"]
+__all__ = [
+    "I32",
+    "LANES",
+    "PAIRED",
+    "PART",
+    "Vector",
+    "call_ir",
+    "lanes_ir",
+    "on_arm",
+    "on_x86",
+    "splat_ir",
+    "vector_bits",
+]
 
 LANES = 64
 """Disparity levels of one vector value."""
-
 
 
 def on_x86() -> bool:

@@ -24,7 +24,7 @@ from stereokit.defaults import METHODS
 from stereokit.errors import DeviceError, InputError, OptionError, shown
 from stereokit.images.check import check_integer
 from stereokit.images.gray import GrayPair, gray_pair, guide_of
-from stereokit.kernels.threads import Job, Workers, available_threads
+from stereokit.kernels.threads import Job, Workers, available_threads, team
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit.options import MatchOptions, StageOptions, WarmupOptions
@@ -374,8 +374,9 @@ class Matcher:
         return Disparity(full.disparity, full.valid, full.confidence, other)
 
     def _match_view(self, pair: GrayPair, threads: int, keeps_blank: bool) -> Disparity:
-        pair = with_blank(pair, self.settings)
-        return concluded(self._pipeline.match(pair, threads), pair, keeps_blank)
+        with team(threads):
+            pair = with_blank(pair, self.settings, threads)
+            return concluded(self._pipeline.match(pair, threads), pair, keeps_blank)
 
 
 def _pipeline(settings: MatchSettings, device: str) -> Pipeline:

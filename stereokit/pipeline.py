@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import CostInput, Levels, Search, takes_8_bits
 from stereokit.errors import OptionError
-from stereokit.images.evidence import blank_pixels, joined
+from stereokit.images.blank import blank_pixels
+from stereokit.images.evidence import joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
 from stereokit.images.resize import half_size, reduced, smooth
 from stereokit.kernels.simd import LANES
-from stereokit.kernels.threads import team
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.chain import post_process
@@ -106,7 +106,7 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 
-def with_blank(pair: GrayPair, settings: MatchSettings) -> GrayPair:
+def with_blank(pair: GrayPair, settings: MatchSettings, threads: int) -> GrayPair:
     """Return the pair with its blank pixels: those around which the left view has no texture as far as a match looks.
 
     Parameters
@@ -116,11 +116,13 @@ def with_blank(pair: GrayPair, settings: MatchSettings) -> GrayPair:
     settings : MatchSettings
         Of whose cost the window counts, of whose smoothing the kernel, and the size of the matching. Costs that do not
         say how far they look have no blank pixels.
+    threads : int
+        Threads to use.
     """
     if settings.reach is None or pair.left_blank is not None:
         return pair
     with span("prepare", "blank pixels"):
-        return replace(pair, left_blank=blank_pixels(pair.left, *settings.reach))
+        return replace(pair, left_blank=blank_pixels(pair.left, *settings.reach, threads))
 
 
 def concluded(result: Disparity, pair: GrayPair, keeps_blank: bool = True) -> Disparity:
@@ -162,7 +164,7 @@ class CpuPipeline:
 
     def match(self, pair: GrayPair, threads: int) -> Disparity:
         """Match a checked pair; see `Pipeline`."""
-        with self._workspaces.take() as workspace, team(threads):
+        with self._workspaces.take() as workspace:
             coarse = self._coarse(pair, workspace, threads)
         return refined(self.settings, coarse, pair, threads)
 
@@ -171,7 +173,7 @@ class CpuPipeline:
         settings = self.settings
         if settings.scale != 1:
             with span("prepare", "half size"):
-                pair = reduced(pair, settings.step)
+                pair = reduced(pair, settings.step, threads)
         return self._map(pair, settings.matched_levels, settings.detail, workspace, threads)
 
     def _search(
@@ -182,7 +184,7 @@ class CpuPipeline:
         if not self.settings.coarse_to_fine or not (is_matched_size or levels.count > LANES):
             return None
         with span("prepare", "half size"):
-            half = half_size(pair, tolerant=True)
+            half = half_size(pair, threads, tolerant=True)
             if pair.ranges is None and getattr(self.settings.cost, "needs_ranges", False):
                 left, right = ((int(view.min()), int(view.max())) for view in (smoothed.left, smoothed.right))
                 half = replace(half, ranges=(left, right))  # all sizes have one range, as in windows of larger images
@@ -194,7 +196,7 @@ class CpuPipeline:
                 workspace.array("search.low", shape, np.uint8),
                 workspace.array("search.high", shape, np.uint8),
             )
-            plan_search(coarse.disparity, coarse.valid, levels, search)
+            plan_search(coarse.disparity, coarse.valid, levels, search, threads)
         return search
 
     def _map(
@@ -249,7 +251,7 @@ class CpuPipeline:
             bad = pair.left_bad if detail is not None else None
             disparity, valid = post_process(disparity, total, bad, chain, workspace, threads)
             if selected is not None:
-                restore_thin(selected, disparity)
+                restore_thin(selected, disparity, threads)
             if pair.left_blank is not None:
                 valid &= ~pair.left_blank
             if confidence is not None:

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from stereokit.errors import FileError, OptionError
 from stereokit.io import make_folder, parsing, read_bytes, read_image, write_bytes
-from stereokit.notices import warn
+from stereokit.notices import say, warn
 from stereokit_evaluation.common.fingerprint import fingerprint
 from stereokit_evaluation.synthetic import models
 from stereokit_evaluation.synthetic.models import MODEL_SUFFIXES, Model, import_trimesh, pack, read_model, unpack
 
-__all__ = ["MANIFEST", "Assets", "read_assets"]
+__all__ = ["MANIFEST", "Assets", "check_assets", "read_assets"]
 
 Bytes = NDArray[np.uint8]
 
@@ -93,6 +93,17 @@ def _model(path: Path) -> Model:
         return unpack(arrays)
 
 
+def check_assets(folder: Path) -> None:
+    """Refuse assets that are no folder.
+
+    Raises
+    ------
+    OptionError
+    """
+    if not folder.is_dir():
+        raise OptionError(f"assets must be a folder, got {str(folder)!r}")
+
+
 def read_assets(folder: Path, cache: Path, step: Callable[[str], object] | None = None) -> Assets:
     """Read the photographs and models of a folder and below; what cannot be used is left out with a warning each.
 
@@ -119,20 +130,19 @@ def read_assets(folder: Path, cache: Path, step: Callable[[str], object] | None 
         If there are models, and trimesh is not installed.
     """
     folder, cache = Path(folder), Path(cache)
-    if not folder.is_dir():
-        raise OptionError(f"assets must be a folder, got {str(folder)!r}")
+    check_assets(folder)
     make_folder("cache", cache)
     contents = _digests(folder)
     if any(_suffix(name) in MODEL_SUFFIXES for name in contents):
         import_trimesh()
-    code = fingerprint([Path(__file__), Path(models.__file__)])
+    code = fingerprint([Path(models.__file__)])
     files: dict[str, Path] = {}
     small = 0
     for name in contents:
         suffix = _suffix(name)
         try:
             if suffix in _PHOTOGRAPHS:
-                path = _stored_photograph(folder, name, contents, cache, code)
+                path = _stored_photograph(folder, name, contents, cache)
                 small += path is None
             elif suffix in MODEL_SUFFIXES:
                 path = _stored_model(folder, name, contents, cache, code)
@@ -153,6 +163,8 @@ def read_assets(folder: Path, cache: Path, step: Callable[[str], object] | None 
             f"assets must hold photographs (PNG, JPEG, {_LEAST} pixels and up) or models (OBJ, GLB, glTF) that can be "
             f"read, got none in {str(folder)!r}"
         )
+    others = f"; {small} pictures are too small or of one tone, and are no textures" if small else ""
+    say(f"assets: {len(photographs)} photographs, {len(shapes)} models{others}")
     digest = hashlib.sha256(json.dumps(sorted(contents.items())).encode()).hexdigest()[:12]
     terms = _terms(folder)
     return Assets(photographs, shapes, digest, dict(Counter(terms.get(name, "not stated") for name in files)), files)
@@ -178,9 +190,9 @@ def _digests(folder: Path) -> dict[str, str]:
     return digests
 
 
-def _stored_photograph(folder: Path, name: str, contents: dict[str, str], cache: Path, code: str) -> Path | None:
+def _stored_photograph(folder: Path, name: str, contents: dict[str, str], cache: Path) -> Path | None:
     """Return the file of a photograph in the cache, None if it is no texture; make it if it is not there."""
-    stem = f"photograph-{contents[name][:16]}-{code}"
+    stem = f"photograph-{contents[name][:16]}-{_LEAST}-{_MOST}-{_TONES:g}"
     path, none = cache / f"{stem}.png", cache / f"{stem}.none"
     if none.exists():
         return None

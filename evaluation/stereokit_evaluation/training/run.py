@@ -23,6 +23,7 @@ from stereokit.methods import check_levels, parse_method
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data.datasets import load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.synthetic.assets import check_assets
 from stereokit_evaluation.training.generated import GENERAL, generated_pairs, levels_for, stored_assets, train_general
 from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of, scene_pair
 
@@ -84,8 +85,10 @@ def run_training(
     """
     torch = _torch()
     check_integer("generated", generated, 0)
-    if assets is not None and generated < 1:
-        raise OptionError(f"assets must come with generated pairs, got {str(assets)!r} and none of them")
+    if assets is not None:
+        check_assets(assets)
+        if generated < 1:
+            raise OptionError(f"assets must come with generated pairs, got {str(assets)!r} and none of them")
     if refiner in GENERAL:
         others: dict[str, Any] = {"dataset": dataset, "streets": streets, "extra": extra, "folds": folds}
         others |= {"frames": frames, "validation": validation}

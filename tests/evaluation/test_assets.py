@@ -173,8 +173,8 @@ def test_a_model_of_many_triangles_is_simplified():
     simple = read_model("field.obj", text.encode(), nothing)
     assert MOST / 8 < len(simple.part) <= MOST
     np.testing.assert_allclose(np.ptp(simple.points, axis=0), np.ptp(field.points, axis=0), atol=0.02)
-    kept, points = _simplified(np.array([[[-0.4, 0, 0], [0.4, 0, 0], [0, 0.4, 0]]] * (MOST + 1)))
-    assert kept.tolist() == [0] and points.shape == (1, 3, 3)  # copies of one triangle are one
+    remaining, points = _simplified(np.array([[[-0.4, 0, 0], [0.4, 0, 0], [0, 0.4, 0]]] * (MOST + 1)))
+    assert remaining.tolist() == [0] and points.shape == (1, 3, 3)  # copies of one triangle are one
 
 
 def stand(own, size, position, turn, seed=0):
@@ -214,7 +214,7 @@ def test_a_picture_lies_on_its_model_as_it_was_drawn(folder, cache):
     np.testing.assert_allclose(shown, np.maximum(linear, 0.01) / linear[0], atol=0.03)
 
 
-@pytest.mark.parametrize("kind", ["room", "pile", "flying", "garden", "closeup"])
+@pytest.mark.parametrize("kind", ["room", "hall", "pile", "flying", "garden", "road", "closeup"])
 def test_pairs_depend_on_seed_and_assets_alone(kind, folder, cache):
     own = read_assets(folder, cache)
     plain = generate_pair(5, kind, size=(96, 64))

@@ -119,10 +119,10 @@ class Copyright:
         return "", "", ""
 
 
-Found = Iterator[tuple[Entry, bytes]]
+Works = Iterator[tuple[Entry, bytes]]
 
 
-def _furniture(tree: Path, package: str, version: str, notice: Copyright) -> Found:
+def _furniture(tree: Path, package: str, version: str, notice: Copyright) -> Works:
     """Yield the models of Sweet Home 3D's libraries, each with its MTL and pictures."""
     for path in sorted((tree / "usr/share/sweethome3d/furniture").glob("*.sh3f")):
         with parsing(path, "furniture library"), zipfile.ZipFile(path) as archive:
@@ -139,10 +139,10 @@ def _furniture(tree: Path, package: str, version: str, notice: Copyright) -> Fou
                 folder = posixpath.dirname(name)
                 if folder not in models or not name.lower().endswith(_MODELS):
                     continue
-                holder, licence, note = notice.terms(f"{path.stem}/{name}")
-                creator, stated = own.get(folder, ("", licence))
-                licence = allowed(licence) and allowed(stated)  # both the library's and the model's
-                if licence is None:
+                holder, general, note = notice.terms(f"{path.stem}/{name}")
+                creator, stated = own.get(folder, ("", general))
+                licence = allowed(stated)
+                if licence is None or allowed(general) is None:  # the model's terms and those of its library
                     continue
                 author = creator or creators.get(folder, "") or holder
                 yield Entry(f"{path.stem}/{name}", package, version, author, licence, note), archive.read(name)
@@ -175,7 +175,7 @@ def _own_terms(text: str) -> tuple[str, str]:
     return author.group(1).strip() if author else "", licence
 
 
-def _textures(tree: Path, package: str, version: str, notice: Copyright) -> Found:
+def _textures(tree: Path, package: str, version: str, notice: Copyright) -> Works:
     """Yield the textures of SuperTuxKart's tracks; its models are of a format of its own."""
     root = tree / "usr/share/games/supertuxkart"
     for part in ("data/library", "data/textures", "data/tracks"):

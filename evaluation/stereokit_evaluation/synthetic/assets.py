@@ -228,7 +228,8 @@ def _stored_model(folder: Path, name: str, contents: dict[str, str], cache: Path
             if all(contents.get(part) == digest for part, digest in stored["needs"].items()):
                 if stored["fault"]:
                     raise FileError(stored["fault"])
-                if (path := cache / stored["file"]).exists():
+                path = cache / str(stored["file"])
+                if path.exists():
                     return path
     needs: dict[str, str | None] = {}
 

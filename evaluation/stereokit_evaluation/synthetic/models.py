@@ -204,7 +204,7 @@ def _corners(scene: Any) -> tuple[Float, Float, Float, NDArray[np.int32], list[A
 def _model(points: Float, normals: Float, uv: Float, part: NDArray[np.int32], materials: list[Any]) -> Model:
     if not np.isfinite(points).all() or np.abs(points).max() > 1e12:
         raise ValueError("a corner has no finite place")
-    looks, pictures, holes = _looks(materials, np.bincount(part, _areas(points), len(materials)))
+    looks, pictures, holes = _looks(materials, np.bincount(part, _areas(points), len(materials)).astype(float))
     shown = (looks[part, 1] < 0.95) & (_areas(points) > 0)
     points, normals, uv, part = points[shown], normals[shown], uv[shown], part[shown]
     if not len(points):
@@ -215,8 +215,8 @@ def _model(points: Float, normals: Float, uv: Float, part: NDArray[np.int32], ma
     points = (points - (low + high) / 2) / longest * np.array([1.0, -1.0, -1.0])
     normals = normals * np.array([1.0, -1.0, -1.0])
     if len(points) > MOST:
-        kept, points = _simplified(points)
-        normals, uv, part = normals[kept], uv[kept], part[kept]
+        remaining, points = _simplified(points)
+        normals, uv, part = normals[remaining], uv[remaining], part[remaining]
     order = np.argsort(part, kind="stable")
     points, normals, uv, part = points[order], normals[order], uv[order], part[order]
     flat_normals = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
@@ -225,7 +225,7 @@ def _model(points: Float, normals: Float, uv: Float, part: NDArray[np.int32], ma
     normals = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), 0)
     agree = np.abs((normals * flat_normals[:, None]).sum(axis=2, keepdims=True)) > 0.7
     normals = np.where(agree, normals, flat_normals[:, None])  # a corner that smooths an edge of a box, or none
-    present = np.isfinite(uv).all(axis=(1, 2))
+    present = np.asarray(np.isfinite(uv).all(axis=(1, 2)))
     uv = np.where(present[:, None, None], uv * [1.0, -1.0] + [0.0, 1.0], 0.0)
     areas, spread = _areas(points), np.abs(_cross(uv))
     for row in range(len(looks)):
@@ -269,23 +269,24 @@ def _simplified(points: Float) -> tuple[NDArray[np.intp], Float]:
         _, cell = np.unique(key, return_inverse=True)
         corner = cell.reshape(-1, 3)
         whole = (corner[:, 0] != corner[:, 1]) & (corner[:, 1] != corner[:, 2]) & (corner[:, 0] != corner[:, 2])
-        kept = np.flatnonzero(whole)
-        _, first = np.unique(np.sort(corner[kept], axis=1), axis=0, return_index=True)
-        kept = kept[np.sort(first)]
-        if len(kept) <= MOST:
+        remaining = np.flatnonzero(whole)
+        _, first = np.unique(np.sort(corner[remaining], axis=1), axis=0, return_index=True)
+        remaining = remaining[np.sort(first)]
+        if len(remaining) <= MOST:
             break
-    if not 0 < len(kept) <= MOST:
+    if not 0 < len(remaining) <= MOST:
         raise ValueError(f"it cannot be simplified to {MOST} triangles")
     size = np.bincount(cell)
     mean = np.stack([np.bincount(cell, flat[:, k]) / size for k in range(3)], axis=1)
-    return kept, mean[corner[kept]]
+    return remaining, mean[corner[remaining]]
 
 
 def _looks(visuals: list[Any], areas: Float) -> tuple[Float, Bytes, Bytes]:
     """Return a row of `Model.looks` for each part, and the pictures that cover most."""
     looks = np.zeros((len(visuals), 5))
     looks[:, 3:] = -1, 1
-    pictures, holes = [], []
+    pictures: list[Bytes] = []
+    holes: list[Bytes] = []
     for row in np.argsort(-areas, kind="stable"):
         brightness, clear, gloss, image, cut = _look(visuals[row])
         looks[row, :3] = brightness, clear, gloss
@@ -298,7 +299,9 @@ def _looks(visuals: list[Any], areas: Float) -> tuple[Float, Bytes, Bytes]:
         if len(pictures) < _PICTURES:
             looks[row, 3] = len(pictures)
             pictures.append(grey)
-            holes.append(opaque[:: SIZE // MASK_SIZE, :: SIZE // MASK_SIZE] if cut else np.ones((MASK_SIZE,) * 2))
+            holes.append(
+                opaque[:: SIZE // MASK_SIZE, :: SIZE // MASK_SIZE] if cut else np.ones((MASK_SIZE,) * 2, np.uint8)
+            )
     looks[:, 0] = np.clip(looks[:, 0], 0.03, 0.9)
     return (
         looks,

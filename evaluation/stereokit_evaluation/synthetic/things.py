@@ -22,6 +22,7 @@ __all__ = [
     "model",
     "plant",
     "solid",
+    "standing",
     "sticks",
     "table",
     "tree",
@@ -371,6 +372,14 @@ SOLIDS: tuple[_Maker, ...] = (
     fur,
 )
 """Makers of loose things: called with the stage, a size, a place, and a turn."""
+
+
+def standing(stage: Stage, most: int, low: float, high: float, spot: Callable[[], Float]) -> None:
+    """Add up to `most` models of the assets, `low` to `high` metres large, that stand at places that `spot` draws."""
+    rng = stage.rng
+    for _ in range(int(rng.integers(most // 4, most)) if has_models(stage) else 0):
+        size = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        model(stage, size, spot() - np.array([0, size / 2, 0]), rotation(float(rng.uniform(-3, 3))))
 
 
 def loose(stage: Stage) -> _Maker:

@@ -123,11 +123,11 @@ def road(stage: Stage) -> None:
         x = float(rng.choice([-1, 1])) * (half + rng.uniform(-0.5, 1.5))
         solid(stage, size, np.array([x, -size / 2, rng.uniform(4, 25)]), rotation(float(rng.uniform(-3, 3))))
 
-    def verge() -> Float:
+    def beside() -> Float:
         """Return a place beside the road."""
         return np.array([float(rng.choice([-1, 1])) * (half + rng.uniform(-0.5, 4)), 0, rng.uniform(3, 25)])
 
-    standing(stage, 12, 0.5, 3.0, verge)
+    standing(stage, 12, 0.5, 3.0, beside)
 
 
 def garden(stage: Stage) -> None:

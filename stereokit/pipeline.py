@@ -62,7 +62,7 @@ class Pipeline(Protocol):
     def replaced(self, **changes: Any) -> Pipeline:
         """Return a pipeline of the same kind whose settings differ in some values."""
 
-    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8, threads: int = 1) -> float:
         """Return the bytes of the buffers for a pair, without images, maps and the refiner.
 
         Parameters
@@ -71,6 +71,8 @@ class Pipeline(Protocol):
             Of the images, pixels.
         dtype : dtype
             Of the grey images, uint8 or uint16.
+        threads : int
+            Each has buffers of its own.
         """
 
 
@@ -160,7 +162,7 @@ class CpuPipeline:
     def __init__(self, settings: MatchSettings) -> None:
         self.settings = settings
         self._workspaces = Pool(Workspace)
-        self._growth: dict[np.dtype[Any], NDArray[np.float64]] = {}  # of the buffers, by type of image
+        self._growth: dict[tuple[np.dtype[Any], int], NDArray[np.float64]] = {}  # of the buffers, by image and threads
 
     def match(self, pair: GrayPair, threads: int) -> Disparity:
         """Match a checked pair; see `Pipeline`."""
@@ -262,19 +264,20 @@ class CpuPipeline:
         """Return a pipeline whose settings differ in some values."""
         return CpuPipeline(self.settings.replaced(**changes))
 
-    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8, threads: int = 1) -> float:
         """Return the bytes of the buffers for a pair; see `Pipeline`. Measured on four small pairs."""
         dtype = np.dtype(dtype)
-        if dtype not in self._growth:
+        threads = min(threads, _PROBES[0] // 4)  # where smaller images do not take as many
+        if (dtype, threads) not in self._growth:
             sizes = [(rows, columns) for rows in _PROBES for columns in _PROBES]
             terms = np.array([(1, rows, columns, rows * columns) for rows, columns in sizes], float)
-            nbytes = np.array([self._buffer_nbytes(*size, dtype) for size in sizes], float)
-            self._growth[dtype] = np.linalg.solve(terms, nbytes)
-        return float(self._growth[dtype] @ (1, height, width, height * width))
+            nbytes = np.array([self._buffer_nbytes(*size, dtype, threads) for size in sizes], float)
+            self._growth[dtype, threads] = np.linalg.solve(terms, nbytes)
+        return float(self._growth[dtype, threads] @ (1, height, width, height * width))
 
-    def _buffer_nbytes(self, height: int, width: int, dtype: Any) -> int:
+    def _buffer_nbytes(self, height: int, width: int, dtype: Any, threads: int) -> int:
         """Return the bytes of the buffers of one match, after matching a made-up pair."""
         image = (np.arange(height * width, dtype=np.uint32) * 2654435761 >> 16).astype(dtype).reshape(height, width)
         workspace = Workspace()
-        self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, 1)
+        self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, threads)
         return workspace.nbytes

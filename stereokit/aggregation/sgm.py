@@ -304,11 +304,11 @@ def _meet(
     begins = [partial(begin, sweep, (*way, *band)) for band in bands for sweep, way in enumerate(ways)]
     if (own := runner()) is not None:
         own.side_by_side(begins)
-        lines = [
-            (partial(end, sweep, sweep % workers, pair, words_for(2)) for pair in _pairs(part))
-            for sweep, part in enumerate(parts)
-        ]
-        own.in_line(lines, -(-width // BLOCK), free)
+
+        def line(sweep: int) -> Iterator[Callable[[], None]]:
+            return (partial(end, sweep, sweep % workers, pair, words_for(2)) for pair in _pairs(parts[sweep]))
+
+        own.in_line([line(sweep) for sweep in range(sweeps)], -(-width // BLOCK), free)
         return
     words = [words_for(height) for _ in parts]
 

@@ -10,20 +10,23 @@ on what memory allows, and the traffic that is printed beside it tells how near 
 from __future__ import annotations
 
 import heapq
+import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from stereokit import matching
 from stereokit.kernels.threads import run
 from stereokit.kernels.trace import tasks_by
+from stereokit_evaluation.bench.table import new_table
 
-__all__ = ["Lines", "Simulated", "Tasks", "TimedTasks", "makespan", "simulate"]
+__all__ = ["Lines", "Simulated", "Tasks", "TimedTasks", "makespan", "print_simulated", "simulate"]
 
 _HAND_OVERS = 200
 """Empty stages whose mean time is that of a hand-over."""
@@ -144,6 +147,8 @@ class Simulated:
     serial_ms : float
         Of that what happens between the tasks, and the hand-overs.
     hand_overs : int
+    traffic_mb : float
+        That the match moves between caches and memory, about: each buffer is written once and read once.
     """
 
     cores: int
@@ -152,6 +157,7 @@ class Simulated:
     path_ms: float
     serial_ms: float
     hand_overs: int
+    traffic_mb: float
 
     @property
     def speed_up(self) -> float:
@@ -207,11 +213,37 @@ def simulate(
             widest = max(count, *(len(s.seconds) for s in timed.stages if isinstance(s, Tasks)))
             spans = makespan(timed.stages, count), makespan(timed.stages, max(widest, left.shape[0]))
             rows[count].append((serial + spans[0], serial + spans[1], serial, len(timed.stages)))
+    traffic = 2 * one.nbytes(*left.shape) / 1e6
     result = []
     for count in cores:
         on_cores, path, serial = (1e3 * median(row[k] for row in rows[count]) for k in range(3))
-        result.append(Simulated(count, 1e3 * median(singles), on_cores, path, serial, rows[count][0][3]))
+        result.append(Simulated(count, 1e3 * median(singles), on_cores, path, serial, rows[count][0][3], traffic))
     return result
+
+
+def print_simulated(simulated: Mapping[tuple[str, str], Sequence[Simulated]]) -> None:
+    """Print simulations by size and method."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    table = new_table("simulated from task times that one thread took, not measured", "size")
+    for head in (
+        "method",
+        "cores",
+        "1 thread ms",
+        "simulated ms",
+        "speed-up",
+        "critical path ms",
+        "serial ms",
+        "share",
+    ):
+        table.add_column(head, justify="right")
+    table.add_column("MB moved", justify="right")
+    for (size, method), rows in simulated.items():
+        for row in rows:
+            figures = (row.one_ms, row.cores_ms, row.speed_up, row.path_ms, row.serial_ms)
+            texts = [f"{figure:.2f}" for figure in figures]
+            share = f"{100 * row.serial_share:.1f} %"
+            table.add_row(size, method, str(row.cores), *texts, share, f"{row.traffic_mb:.0f}")
+    console.print(table)
 
 
 def _matcher(method: str, levels: int, threads: int, options: Any, left: Any, right: Any) -> matching.Matcher:

@@ -88,10 +88,8 @@ class Statistics(NamedTuple):
 class ColumnSums(NamedTuple):
     """Sums of products over the columns of the windows around one row, which slide with it; of one worker."""
 
-    row: NDArray[np.int64]  # (1,): that row, or -1
-    sums: NDArray[
-        np.int32
-    ]  # n times those of columns 0 .. c together, element ((d // 64) * (C + 1) + c + 1) * 64 + d % 64
+    row: NDArray[np.int64]  # (3,): that row, or -1, the first column and the one behind the last
+    sums: NDArray[np.int32]  # n times those of all columns up to c, element ((d // 64) * (C + 1) + c + 1) * 64 + d % 64
     factors: NDArray[np.int32]  # n * left pixels of the row that comes (low half), -n * those of the one that goes
     pairs: NDArray[np.int32]  # right pixels of the row that comes and of the one that goes, as of `store_pair`
 
@@ -228,7 +226,7 @@ class Zncc:
         sums, pairs = ((width + 2 * half + 1) * padded, 1) if pair.starts is None else (self.window * LANES, half + 1)
         for worker in range(workers):
             columns = ColumnSums(
-                row=workspace.array(f"zncc.row{worker}", 1, np.int64),
+                row=workspace.array(f"zncc.row{worker}", 3, np.int64),
                 sums=workspace.array(f"zncc.sums{worker}", sums, np.int32),
                 factors=workspace.array(f"zncc.factors{worker}", pairs * (width + 2 * half), np.int32),
                 pairs=workspace.array(f"zncc.pairs{worker}", pairs * (right_width + 2 * half), np.int32),
@@ -324,34 +322,43 @@ def _statistics(
 
 
 @inline
-def _write_pairs(rows: ZnccRows, place: int, low_row: int, high_row: int, low_n: int, high_n: int) -> None:
+def _write_pairs(
+    rows: ZnccRows, x0: int, x1: int, place: int, low_row: int, high_row: int, low_n: int, high_n: int
+) -> None:
     """Write two rows of the padded right image into the halves of lanes, and those of the left one times a factor.
 
-    `place` counts pairs of rows; a row that is -1 is none.
+    What the windows around columns x0..x1 need of them. `place` counts pairs of rows; a row that is -1 is none.
     """
     images = rows.images
-    new = max(low_row, 0) * images.right_stride
-    old = max(high_row, 0) * images.right_stride
+    first = rows.cells.width - x1  # right pixel of level 0 of the last column
+    count = min(x1 - x0 + rows.cells.padded + 2 * rows.half, images.right_stride - first)
+    new = max(low_row, 0) * images.right_stride + first
+    old = max(high_row, 0) * images.right_stride + first
     at = place * images.right_stride
-    for k in range(images.right_stride):
-        store_pair(rows.columns.pairs, at, images.right_stride, k, images.right[new + k], images.right[old + k])
-    new = max(low_row, 0) * images.left_stride
-    old = max(high_row, 0) * images.left_stride
-    factors = rows.columns.factors[place * images.left_stride : (place + 1) * images.left_stride]
+    right_low = images.right[new : new + count]
+    right_high = images.right[old : old + count]
+    for k in range(count):
+        store_pair(rows.columns.pairs, at, images.right_stride, first + k, right_low[k], right_high[k])
+    count = x1 - x0 + 2 * rows.half
+    new = max(low_row, 0) * images.left_stride + x0
+    old = max(high_row, 0) * images.left_stride + x0
+    at = place * images.left_stride + x0
     n_low = np.int32(low_n if low_row >= 0 else 0)
     n_high = np.int32(high_n << 16 if high_row >= 0 else 0)
-    for c in range(images.left_stride):
+    left_low = images.left[new : new + count]
+    left_high = images.left[old : old + count]
+    factors = rows.columns.factors[at : at + count]
+    for c in range(count):
         # Numba multiplies 64 bits; as they are cut once, at the end, LLVM makes it 32, and vectors.
-        low = np.int64(n_low) * np.int64(images.left[new + c]) & 0xFFFF
-        high = np.int64(n_high) * np.int64(images.left[old + c])
-        factors[c] = np.int32(low + high)
+        low = np.int64(n_low) * np.int64(left_low[c]) & 0xFFFF
+        factors[c] = np.int32(low + np.int64(n_high) * np.int64(left_high[c]))
 
 
 @inline
-def _pair_rows(rows: ZnccRows, row_in: int, row_out: int) -> None:
+def _pair_rows(rows: ZnccRows, x0: int, x1: int, row_in: int, row_out: int) -> None:
     """Fill `pairs` and `factors` for a row of the padded images that comes and one that goes; -1 is none."""
     n = (2 * rows.half + 1) ** 2
-    _write_pairs(rows, 0, row_in, row_out, n, -n)
+    _write_pairs(rows, x0, x1, 0, row_in, row_out, n, -n)
 
 
 class _Column(NamedTuple):
@@ -385,15 +392,18 @@ def _gain(gained: Any, lane: int, column: _Column) -> Any:
 
 
 @inline
-def _start_sums(rows: ZnccRows, y: int) -> None:
-    """Fill the column sums with all rows of the window around row `y` but the last."""
-    for at in range(0, rows.columns.sums.size, PART):
-        store(rows.columns.sums, at, splat_part(np.int32(0)))
+def _start_sums(rows: ZnccRows, y: int, x0: int, x1: int) -> None:
+    """Fill the sums of columns x0..x1 with all rows of the window around row `y` but the last."""
+    columns = rows.columns.factors.size
+    for n in range(len(rows.cells.blocks)):
+        for c in range(x0 - 1, x1 + 2 * rows.half):  # before column x0 they are 0
+            for lane in range(0, LANES, PART):
+                store(rows.columns.sums, (n * (columns + 1) + c + 1) * LANES + lane, splat_part(np.int32(0)))
     for row in range(y, y + 2 * rows.half):
-        _pair_rows(rows, row, -1)
+        _pair_rows(rows, x0, x1, row, -1)
         for n in range(len(rows.cells.blocks)):
             gained = splat_parts(np.int32(0))
-            for c in range(rows.columns.factors.size):
+            for c in range(x0, x1 + 2 * rows.half):
                 gained = each_part(_gain, gained, 0, _column(rows, c, n * LANES))
 
 
@@ -463,10 +473,11 @@ def _slide(gained: Any, lane: int, window: _Window) -> Any:
 
 @implements(ZnccRows)
 @kernel
-def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
+def _zncc_row(rows: ZnccRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
     cells = rows.cells
     window = 2 * rows.half + 1
-    last = rows.columns.row[0]
+    state = rows.columns.row
+    last = state[0] if state[1] == x0 and state[2] == x1 else np.int64(-1)
     row_in = np.int64(-1)  # of the padded image: row y of it is the top of the window around row y
     row_out = np.int64(-1)
     if last >= 0 and y == last + 1:
@@ -476,20 +487,22 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
         row_in = np.int64(y)
         row_out = last + window - 1
     elif y != last:
-        _start_sums(rows, y)
+        _start_sums(rows, y, x0, x1)
         row_in = y + window - 1
-    rows.columns.row[0] = y
-    _pair_rows(rows, row_in, row_out)
+    state[0] = y
+    state[1] = x0
+    state[2] = x1
+    _pair_rows(rows, x0, x1, row_in, row_out)
     padded = LANES * len(cells.blocks)
     for n in range(len(cells.blocks)):
         block = n * LANES
         gained = splat_parts(np.int32(0))
-        for c in range(window - 1):
+        for c in range(x0, x0 + window - 1):
             gained = each_part(_gain, gained, 0, _column(rows, c, block))
-        for x in range(cells.width):
+        for x in range(x0, x1):
             pixel = _pixel(rows, y, x, block, x * padded + block, out)
             gained = each_part(_slide, gained, 0, _Window(pixel, _column(rows, x + window - 1, block)))
-    mask_row(cells, y, out)
+    mask_row(cells, y, x0, x1, out)
 
 
 class _NarrowPair(NamedTuple):
@@ -556,16 +569,16 @@ def _narrow_slide(sums: Any, lane: int, place: _Place) -> Any:
 
 @implements(NarrowZnccRows)
 @kernel
-def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, out: NDArray[np.uint8]) -> None:
+def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
     rows = narrow.window
     cells = rows.cells
     window = 2 * rows.half + 1
     n = window * window
     for pair in range(rows.half + 1):
-        _write_pairs(rows, pair, y + 2 * pair, y + 2 * pair + 1 if pair < rows.half else -1, n, n)
+        _write_pairs(rows, x0, x1, pair, y + 2 * pair, y + 2 * pair + 1 if pair < rows.half else -1, n, n)
     before = np.int64(-1)
     sums = splat_parts(np.int32(0))
-    for x in range(cells.width):
+    for x in range(x0, x1):
         start = np.int64(narrow.starts[y * cells.width + x])
         newest = x + window - 1
         pixel = _pixel(rows, y, x, start, x * LANES, out)
@@ -577,4 +590,4 @@ def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, out: NDArray[np.uint8]) -> 
         before = start
         sums = _add_column(rows, sums, newest, start)
         sums = each_part(_narrow_slide, sums, 0, _Place(pixel, newest % window * LANES))
-    mask_narrow_row(cells, narrow.starts, y, out)
+    mask_narrow_row(cells, narrow.starts, y, x0, x1, out)

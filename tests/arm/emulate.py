@@ -119,8 +119,10 @@ def record(folder: Path) -> None:
     def cost_rows(rows: Any, blocks: int) -> None:
         kernel = of_cost[type(rows)]
         out = np.zeros(WIDTH * blocks * 64, np.uint8)
-        kernel(rows, 1, out)
-        recorder.call(f"{label.split('.')[0]}.{kernel.py_func.__name__}", kernel, WIDTH * blocks, rows, 2, out)
+        kernel(rows, 1, 0, WIDTH, out)
+        recorder.call(
+            f"{label.split('.')[0]}.{kernel.py_func.__name__}", kernel, WIDTH * blocks, rows, 2, 0, WIDTH, out
+        )
         if hasattr(rows, "columns"):
             rows.columns.row[0] = -1
 

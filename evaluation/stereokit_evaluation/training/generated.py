@@ -23,11 +23,12 @@ from stereokit.errors import OptionError
 from stereokit.images.check import check_integer, check_number
 from stereokit.io import make_folder
 from stereokit_evaluation.common.progress import progress
-from stereokit_evaluation.synthetic.generated import pairs
+from stereokit_evaluation.synthetic.assets import Assets, read_assets
+from stereokit_evaluation.synthetic.generated import pair_name, pairs
 from stereokit_evaluation.training.pairs import FIRST_SEED
 from stereokit_refiners.training.samples import Pair
 
-__all__ = ["GENERAL", "generated_pairs", "levels_for", "train_general"]
+__all__ = ["GENERAL", "generated_pairs", "levels_for", "stored_assets", "train_general"]
 
 GENERAL = ("stereokit", "general")
 """Names of the refiner that trains on generated pairs alone."""
@@ -36,7 +37,21 @@ _SAMPLES = 5  # of each pair: matchers, sizes, options and cameras, drawn from i
 _SETTINGS = {"steps": 30000, "learning_rate": 2e-3, "batch": 4, "seed": 0, "rows": 256, "columns": 384}
 
 
-def generated_pairs(count: int, folder: Path) -> Iterator[Pair]:
+def stored_assets(folder: Path | None, cache: Path) -> Assets | None:
+    """Read the folder of assets, if there is one; what scenes read of it is stored in ``cache/assets``.
+
+    Raises
+    ------
+    OptionError, FileError, StereokitError
+        As `read_assets`.
+    """
+    if folder is None:
+        return None
+    with progress(None) as (_, step):
+        return read_assets(folder, cache / "assets", step)
+
+
+def generated_pairs(count: int, folder: Path, assets: Assets | None = None) -> Iterator[Pair]:
     """Yield generated pairs as pairs for training; each is rendered once and stored in a folder.
 
     Parameters
@@ -44,8 +59,10 @@ def generated_pairs(count: int, folder: Path) -> Iterator[Pair]:
     count : int
         How many; seeds start at `stereokit_evaluation.training.pairs.FIRST_SEED`.
     folder : Path
+    assets : Assets, optional
+        Photographs and models for the scenes.
     """
-    for pair in pairs(count, FIRST_SEED, folder=folder):
+    for pair in pairs(count, FIRST_SEED, folder=folder, assets=assets):
         yield Pair(f"{pair.kind}-{pair.seed}", pair.left, pair.right, pair.noc, pair.occ)
 
 
@@ -55,7 +72,13 @@ def levels_for(pair: Pair) -> int:
 
 
 def train_general(
-    output: Path, count: int, *, start: Path | None = None, settings: Sequence[str] = (), cache: Path | None = None
+    output: Path,
+    count: int,
+    *,
+    start: Path | None = None,
+    settings: Sequence[str] = (),
+    cache: Path | None = None,
+    assets: Path | None = None,
 ) -> dict[str, Any]:
     """Train the general refiner; killed, it goes on when called again with the same options.
 
@@ -71,6 +94,8 @@ def train_general(
         ``KEY=VALUE``: steps, learning_rate, batch, seed, and rows and columns of the crops, full-size pixels.
     cache : Path, optional
         Folder of pairs and samples; by default ``output/cache``.
+    assets : Path, optional
+        Folder of photographs and models for the scenes.
 
     Returns
     -------
@@ -88,16 +113,19 @@ def train_general(
     cache = output / "cache" if cache is None else cache
     for name, folder in (("output", output), ("cache", cache)):
         make_folder(name, folder)
+    own = stored_assets(assets, cache)
     with progress(count * (1 + _SAMPLES)) as (_, step):
         rendered = cache / "pairs"
-        for pair in pairs(count, FIRST_SEED, folder=rendered):
+        for pair in pairs(count, FIRST_SEED, folder=rendered, assets=own):
             step(f"{pair.kind} {pair.seed}")
-        exact, samples = _exactly(rendered, count, cache)
+        exact, samples = _exactly(rendered, count, cache, own)
         for number in range(_SAMPLES):
             evidence._store(exact, samples, number + 1)
             step(f"samples {number + 1} of each pair", count)
     weights = output / "weights.safetensors"
-    notes = {"generated": count, "first_seed": FIRST_SEED, "settings": chosen}
+    notes: dict[str, Any] = {"generated": count, "first_seed": FIRST_SEED, "settings": chosen}
+    if own is not None:
+        notes["assets"] = own.notes
     with redirect_stdout(sys.stderr):  # what it reports on the way is no result
         evidence.fit(
             samples, weights, steps=chosen["steps"], rate=chosen["learning_rate"], batch=chosen["batch"],
@@ -105,21 +133,14 @@ def train_general(
         )  # fmt: skip
     return {
         "refiner": GENERAL[0], "settings": chosen, "methods": ["S1", "S2", "S3", "S4"], "generated": count,
+        "assets": None if own is None else own.notes,
         "frames": [], "results": [{"folder": str(output), "held_out": []}], "pooled": {}, "rank": 0,
     }  # fmt: skip
 
 
-def _exactly(rendered: Path, count: int, cache: Path) -> tuple[Path, Path]:
+def _exactly(rendered: Path, count: int, cache: Path, assets: Assets | None = None) -> tuple[Path, Path]:
     """Return a folder that holds these pairs and no others, and one for their samples."""
-    names = sorted(path.name for path in rendered.glob("*.npz"))
-    wanted = [name for name in names if FIRST_SEED <= int(name.split("-")[1]) < FIRST_SEED + count]
-    newest: dict[str, Path] = {}
-    for name in wanted:  # of a seed that was rendered by other sources too, the last counts
-        path = rendered / name
-        seed = name.split("-")[1]
-        if seed not in newest or path.stat().st_mtime_ns >= newest[seed].stat().st_mtime_ns:
-            newest[seed] = path
-    chosen = sorted(newest.values())
+    chosen = sorted(rendered / pair_name(seed, assets=assets) for seed in range(FIRST_SEED, FIRST_SEED + count))
     key = f"{zlib.crc32('/'.join(path.name for path in chosen).encode()):08x}"
     exact, samples = cache / f"pairs-{key}", cache / f"samples-{key}"
     for folder in (exact, samples):

@@ -44,6 +44,7 @@ from stereokit.kernels.simd.arithmetic import (
     shift_left,
     shift_right,
     subtract,
+    without_three,
     xor,
 )
 from stereokit.kernels.simd.memory import (
@@ -113,5 +114,6 @@ __all__ = [
     "stream_fence",
     "subtract",
     "vector_bits",
+    "without_three",
     "xor",
 ]

@@ -114,7 +114,7 @@ def count(signatures: str, out: str) -> None:
         kernel = getattr(importlib.import_module(name), key)
         for number, signature in enumerate(overloads):
             kernel.compile(signature)
-            text = kernel.inspect_asm(kernel.signatures[-1])
+            text = kernel.inspect_asm(signature)
             table[f"{key}.{number}" if number else key] = counted(text)
     Path(out).write_text(json.dumps(table), encoding="utf-8")
 

@@ -177,7 +177,7 @@ def compile_(folder: Path, processor: str, only: str = "") -> None:
         if key not in done:
             kernel = getattr(importlib.import_module(case["module"]), case["kernel"])
             kernel.compile(case["kinds"])
-            overload = kernel.overloads[kernel.signatures[-1]]
+            overload = kernel.overloads[case["kinds"]]
             library = overload.library
             done[key] = f"{len(done)}"
             library._ensure_finalized()

@@ -28,13 +28,13 @@ def blank_pixels(gray: NDArray[Any], across: int, down: int, threads: int = 1) -
     height, width = gray.shape
     bands = spans(height, threads)
     same = np.empty(gray.shape, np.uint8)
-    rows_with, rows_blank = np.zeros((2, height), np.uint8)
+    marked_rows, rows_blank = np.zeros((2, height), np.uint8)
     blank = np.empty(gray.shape, np.bool_)
     lines = np.empty((len(bands), width + 2 * across), np.uint8)
     run_stages(
         [
-            [partial(_same_along, gray, across, *band, lines[k], same, rows_with) for k, band in enumerate(bands)],
-            [partial(_same_around, gray, down, *band, same, rows_with, blank, rows_blank) for band in bands],
+            [partial(_same_along, gray, across, *band, lines[k], same, marked_rows) for k, band in enumerate(bands)],
+            [partial(_same_around, gray, down, *band, same, marked_rows, blank, rows_blank) for band in bands],
         ],
         threads,
     )
@@ -44,7 +44,7 @@ def blank_pixels(gray: NDArray[Any], across: int, down: int, threads: int = 1) -
 @kernel
 def _same_along(
     gray: NDArray[Any], across: int, y0: int, y1: int, line: NDArray[np.uint8], same: NDArray[np.uint8],
-    found: NDArray[np.uint8],
+    marked_rows: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """Mark the pixels of rows y0..y1 that are equal to all `across` to their left and right, and rows with such."""
     width = gray.shape[1]
@@ -63,12 +63,12 @@ def _same_along(
         any_mark = np.uint8(0)
         for x in range(width):
             any_mark |= marks[x]
-        found[y] = any_mark
+        marked_rows[y] = any_mark
 
 
 @kernel
 def _same_around(
-    gray: NDArray[Any], down: int, y0: int, y1: int, same: NDArray[np.uint8], found: NDArray[np.uint8],
+    gray: NDArray[Any], down: int, y0: int, y1: int, same: NDArray[np.uint8], marked_rows: NDArray[np.uint8],
     blank: NDArray[np.bool_], blank_rows: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """Mark the pixels of rows y0..y1 around which all marks of `same` are set and all columns equal, and their rows."""
@@ -77,7 +77,7 @@ def _same_around(
         first = max(y - down, 0)
         last = min(y + down, height - 1)
         is_blank = blank[y]
-        is_blank[:] = found[first : last + 1].all()
+        is_blank[:] = marked_rows[first : last + 1].all()
         if not is_blank[0]:
             continue
         for other in range(first, last + 1):

@@ -92,10 +92,10 @@ def test_more_cores_are_never_slower_and_one_has_no_gain():
 
 def test_the_command_prints_and_writes_what_was_simulated(tmp_path):
     path = tmp_path / "s.json"
-    given = ["bench", "--simulate", "2,4", "--sizes", "96x64x32", "--method", "S2", "--rounds", "1"]
-    result = CliRunner().invoke(app, given)
+    command = ["bench", "--simulate", "2,4", "--sizes", "96x64x32", "--method", "S2", "--rounds", "1"]
+    result = CliRunner().invoke(app, command)
     assert result.exit_code == 0 and "simulated from task times" in result.output and "4" in result.output
-    result = CliRunner().invoke(app, [*given, "--json", str(path)])
+    result = CliRunner().invoke(app, [*command, "--json", str(path)])
     assert result.exit_code == 0
     rows = json.loads(path.read_text())["simulated"]
     assert [row["cores"] for row in rows] == [2, 4] and all(row["speed_up"] > 0 for row in rows)

@@ -257,8 +257,8 @@ def _simulate(
                 step(f"{size.name}: {label(name)}")
     rows = [
         {"size": size, "method": name, **asdict(row), "speed_up": row.speed_up, "serial_share": row.serial_share}
-        for (size, name), found in simulated.items()
-        for row in found
+        for (size, name), matches in simulated.items()
+        for row in matches
     ]
     if not write_json(json_file, {"simulated": rows, "machine": machine_info, "versions": versions()}):
         print_simulated(simulated)

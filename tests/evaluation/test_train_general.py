@@ -16,8 +16,9 @@ import stereokit  # noqa: E402
 from stereokit.cli.app import app  # noqa: E402
 from stereokit_evaluation.training.general import RealFrames, _score  # noqa: E402
 from stereokit_refiners.learned import LearnedRefiner  # noqa: E402
+from stereokit_refiners.networks.layers import shapes  # noqa: E402
 from stereokit_refiners.training import evidence  # noqa: E402
-from stereokit_refiners.weights import read, shipped  # noqa: E402
+from stereokit_refiners.weights import NETWORKS, WeightFile, read, shipped, write  # noqa: E402
 
 SHIFTS = {0: 5, 1: 9, 2: 7, 3: 11}
 """Disparity of each frame; 2 has truth of all pixels alone."""
@@ -64,7 +65,7 @@ def on_kitti(kitti, out, *words):
 
 def test_frames_are_trained_on_and_held_out_ones_are_scored(kitti, tmp_path, monkeypatch):
     start = tmp_path / "start.safetensors"
-    start.write_bytes((stereokit_weights() / "evidence.safetensors").read_bytes())
+    write(start, shipped("evidence"))
     made, real = [], evidence.make_sample
 
     def counted(*arguments, **options):
@@ -89,12 +90,6 @@ def test_frames_are_trained_on_and_held_out_ones_are_scored(kitti, tmp_path, mon
     image = np.random.default_rng(1).integers(0, 256, (64, 96), dtype=np.uint8)
     refined = stereokit.match(image, image, scale=0.5, refiner=str(tmp_path / "out" / "weights.safetensors"))
     assert refined.shape == image.shape
-
-
-def stereokit_weights():
-    from importlib.resources import files
-
-    return files("stereokit_refiners") / "weights"
 
 
 def test_each_fold_is_held_out_once_and_never_trained_on(kitti, tmp_path):
@@ -152,12 +147,9 @@ def test_scores_are_those_of_the_refiner(kitti):
     ],
 )  # fmt: skip
 def test_bad_options_end_with_one_line(words, parts, kitti, tmp_path):
-    from refining import tuned_to_kitti
-
-    from stereokit_refiners.weights import write
-
     if "other" in words:
-        write(tmp_path / "other", tuned_to_kitti("cnn"))
+        arrays = {name: np.zeros(shape, np.float32) for name, shape in shapes(NETWORKS["cnn"]).items()}
+        write(tmp_path / "other", WeightFile("cnn", "residual", arrays))
     words = [tmp_path / "other" if word == "other" else word for word in words]
     result = run("-o", tmp_path / "out", "--root", kitti, *words)
     lines = result.output.strip().splitlines()

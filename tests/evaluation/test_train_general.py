@@ -66,16 +66,16 @@ def on_kitti(kitti, out, *words):
 def test_frames_are_trained_on_and_held_out_ones_are_scored(kitti, tmp_path, monkeypatch):
     start = tmp_path / "start.safetensors"
     write(start, shipped("evidence"))
-    made, real = [], evidence.make_sample
+    calls, real = [], evidence.make_sample
 
     def counted(*arguments, **options):
-        made.append(arguments)
+        calls.append(arguments)
         return real(*arguments, **options)
 
     monkeypatch.setattr(evidence, "make_sample", counted)
     words = ["--frames", "0-2", "--validation", "3", "--start", start]
     report = on_kitti(kitti, tmp_path / "out", *words)
-    assert len(made) == 6  # frames, variants
+    assert len(calls) == 6  # frames, variants
     content = read(tmp_path / "out" / "weights.safetensors")
     assert content.network == "evidence" and content.ranges
     assert content.notes["frames"] == [f"kitti2015/{k:06d}_10" for k in range(3)]
@@ -86,7 +86,7 @@ def test_frames_are_trained_on_and_held_out_ones_are_scored(kitti, tmp_path, mon
     assert known == 28 * (224 - SHIFTS[3]) and bad < 0.05 * known
     assert report["pooled"] == {"S2": pytest.approx(100 * bad / known)}
     again = on_kitti(kitti, tmp_path / "out", *words)
-    assert again == report and len(made) == 6
+    assert again == report and len(calls) == 6
     image = np.random.default_rng(1).integers(0, 256, (64, 96), dtype=np.uint8)
     refined = stereokit.match(image, image, scale=0.5, refiner=str(tmp_path / "out" / "weights.safetensors"))
     assert refined.shape == image.shape

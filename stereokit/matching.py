@@ -24,7 +24,7 @@ from stereokit.defaults import METHODS
 from stereokit.errors import DeviceError, InputError, OptionError, shown
 from stereokit.images.check import check_integer
 from stereokit.images.gray import GrayPair, gray_pair, guide_of
-from stereokit.kernels.threads import Job, Workers, available_threads
+from stereokit.kernels.threads import Job, Workers, available_threads, team
 from stereokit.kernels.trace import span
 from stereokit.notices import PairWarning, collecting, warn
 from stereokit.options import MatchOptions, StageOptions, WarmupOptions
@@ -187,7 +187,7 @@ class Matcher:
 
     def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
         """Return the bytes of the buffers for a pair; see `stereokit.pipeline.Pipeline`."""
-        return self._pipeline.nbytes(height, width, dtype)
+        return self._pipeline.nbytes(height, width, dtype, self.threads)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"settings": self.settings, "threads": self.threads, "device": self.device}
@@ -278,9 +278,10 @@ class Matcher:
         self, pairs: Iterable[tuple[Any, Any]], *, progress: Callable[[int], object] | None = None,
         mask: Any = None, right_mask: Any = None,
     ) -> Iterator[Disparity]:  # fmt: skip
-        """Match a sequence of pairs, several frames at a time, one thread each.
+        """Match a sequence of pairs, as many at a time as are waiting.
 
-        Frames in parallel use the processors better than threads within a frame, and any number of them. The
+        Frames in parallel use the processors better than threads within a frame, so each frame gets one thread where
+        as many wait as there are threads, and its share of them where fewer do, as from a camera or at the end. The
         results are those of one call per pair, and come in the order of the pairs.
 
         Parameters
@@ -311,7 +312,17 @@ class Matcher:
         source = iter(pairs)
         # On a GPU each worker has its own buffers.
         workers = Workers(self.threads if self.device == "cpu" else min(2, self.threads))
+        unfinished: set[int] = set()  # frames that wait or are matched
+
+        def call(number: int, left: Any, right: Any) -> tuple[Disparity, list[str]]:
+            share = self.threads // max(1, len(unfinished)) if self.device == "cpu" else 1
+            try:
+                return self._call(left, right, mask, right_mask, max(1, share))
+            finally:
+                unfinished.discard(number)
+
         try:
+            numbers = itertools.count()
             has_warned = False
             failure: Exception | None = None  # of the source; the pairs before it are still matched
             for count in itertools.count(1):
@@ -324,7 +335,9 @@ class Matcher:
                     except Exception as error:
                         failure = error
                     else:
-                        queue.append(Job(self._call, left, right, mask, right_mask, 1))
+                        number = next(numbers)
+                        unfinished.add(number)
+                        queue.append(Job(call, number, left, right))
                         workers.submit(queue[-1])
                 if not queue:
                     if isinstance(failure, StopIteration):
@@ -374,8 +387,9 @@ class Matcher:
         return Disparity(full.disparity, full.valid, full.confidence, other)
 
     def _match_view(self, pair: GrayPair, threads: int, keeps_blank: bool) -> Disparity:
-        pair = with_blank(pair, self.settings)
-        return concluded(self._pipeline.match(pair, threads), pair, keeps_blank)
+        with team(threads):
+            pair = with_blank(pair, self.settings, threads)
+            return concluded(self._pipeline.match(pair, threads), pair, keeps_blank)
 
 
 def _pipeline(settings: MatchSettings, device: str) -> Pipeline:

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import CostInput, Levels, Search, takes_8_bits
 from stereokit.errors import OptionError
-from stereokit.images.evidence import blank_pixels, joined
+from stereokit.images.blank import blank_pixels
+from stereokit.images.evidence import joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
 from stereokit.images.resize import half_size, reduced, smooth
 from stereokit.kernels.simd import LANES
-from stereokit.kernels.threads import team
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.chain import post_process
@@ -62,7 +62,7 @@ class Pipeline(Protocol):
     def replaced(self, **changes: Any) -> Pipeline:
         """Return a pipeline of the same kind whose settings differ in some values."""
 
-    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8, threads: int = 1) -> float:
         """Return the bytes of the buffers for a pair, without images, maps and the refiner.
 
         Parameters
@@ -71,6 +71,8 @@ class Pipeline(Protocol):
             Of the images, pixels.
         dtype : dtype
             Of the grey images, uint8 or uint16.
+        threads : int
+            Each has buffers of its own.
         """
 
 
@@ -106,7 +108,7 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 
-def with_blank(pair: GrayPair, settings: MatchSettings) -> GrayPair:
+def with_blank(pair: GrayPair, settings: MatchSettings, threads: int) -> GrayPair:
     """Return the pair with its blank pixels: those around which the left view has no texture as far as a match looks.
 
     Parameters
@@ -116,11 +118,13 @@ def with_blank(pair: GrayPair, settings: MatchSettings) -> GrayPair:
     settings : MatchSettings
         Of whose cost the window counts, of whose smoothing the kernel, and the size of the matching. Costs that do not
         say how far they look have no blank pixels.
+    threads : int
+        Threads to use.
     """
     if settings.reach is None or pair.left_blank is not None:
         return pair
     with span("prepare", "blank pixels"):
-        return replace(pair, left_blank=blank_pixels(pair.left, *settings.reach))
+        return replace(pair, left_blank=blank_pixels(pair.left, *settings.reach, threads))
 
 
 def concluded(result: Disparity, pair: GrayPair, keeps_blank: bool = True) -> Disparity:
@@ -158,11 +162,11 @@ class CpuPipeline:
     def __init__(self, settings: MatchSettings) -> None:
         self.settings = settings
         self._workspaces = Pool(Workspace)
-        self._growth: dict[np.dtype[Any], NDArray[np.float64]] = {}  # of the buffers, by type of image
+        self._growth: dict[tuple[np.dtype[Any], int], NDArray[np.float64]] = {}  # of the buffers, by image and threads
 
     def match(self, pair: GrayPair, threads: int) -> Disparity:
         """Match a checked pair; see `Pipeline`."""
-        with self._workspaces.take() as workspace, team(threads):
+        with self._workspaces.take() as workspace:
             coarse = self._coarse(pair, workspace, threads)
         return refined(self.settings, coarse, pair, threads)
 
@@ -171,7 +175,7 @@ class CpuPipeline:
         settings = self.settings
         if settings.scale != 1:
             with span("prepare", "half size"):
-                pair = reduced(pair, settings.step)
+                pair = reduced(pair, settings.step, threads)
         return self._map(pair, settings.matched_levels, settings.detail, workspace, threads)
 
     def _search(
@@ -182,7 +186,7 @@ class CpuPipeline:
         if not self.settings.coarse_to_fine or not (is_matched_size or levels.count > LANES):
             return None
         with span("prepare", "half size"):
-            half = half_size(pair, tolerant=True)
+            half = half_size(pair, threads, tolerant=True)
             if pair.ranges is None and getattr(self.settings.cost, "needs_ranges", False):
                 left, right = ((int(view.min()), int(view.max())) for view in (smoothed.left, smoothed.right))
                 half = replace(half, ranges=(left, right))  # all sizes have one range, as in windows of larger images
@@ -194,7 +198,7 @@ class CpuPipeline:
                 workspace.array("search.low", shape, np.uint8),
                 workspace.array("search.high", shape, np.uint8),
             )
-            plan_search(coarse.disparity, coarse.valid, levels, search)
+            plan_search(coarse.disparity, coarse.valid, levels, search, threads)
         return search
 
     def _map(
@@ -249,7 +253,7 @@ class CpuPipeline:
             bad = pair.left_bad if detail is not None else None
             disparity, valid = post_process(disparity, total, bad, chain, workspace, threads)
             if selected is not None:
-                restore_thin(selected, disparity)
+                restore_thin(selected, disparity, threads)
             if pair.left_blank is not None:
                 valid &= ~pair.left_blank
             if confidence is not None:
@@ -260,19 +264,20 @@ class CpuPipeline:
         """Return a pipeline whose settings differ in some values."""
         return CpuPipeline(self.settings.replaced(**changes))
 
-    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8, threads: int = 1) -> float:
         """Return the bytes of the buffers for a pair; see `Pipeline`. Measured on four small pairs."""
         dtype = np.dtype(dtype)
-        if dtype not in self._growth:
+        threads = min(threads, _PROBES[0] // 4)  # where smaller images do not take as many
+        if (dtype, threads) not in self._growth:
             sizes = [(rows, columns) for rows in _PROBES for columns in _PROBES]
             terms = np.array([(1, rows, columns, rows * columns) for rows, columns in sizes], float)
-            nbytes = np.array([self._buffer_nbytes(*size, dtype) for size in sizes], float)
-            self._growth[dtype] = np.linalg.solve(terms, nbytes)
-        return float(self._growth[dtype] @ (1, height, width, height * width))
+            nbytes = np.array([self._buffer_nbytes(*size, dtype, threads) for size in sizes], float)
+            self._growth[dtype, threads] = np.linalg.solve(terms, nbytes)
+        return float(self._growth[dtype, threads] @ (1, height, width, height * width))
 
-    def _buffer_nbytes(self, height: int, width: int, dtype: Any) -> int:
+    def _buffer_nbytes(self, height: int, width: int, dtype: Any, threads: int) -> int:
         """Return the bytes of the buffers of one match, after matching a made-up pair."""
         image = (np.arange(height * width, dtype=np.uint32) * 2654435761 >> 16).astype(dtype).reshape(height, width)
         workspace = Workspace()
-        self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, 1)
+        self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, threads)
         return workspace.nbytes

@@ -16,6 +16,8 @@ and more; two steps of cost instead of one change little.
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,7 @@ from numpy.typing import NDArray
 from stereokit.costs.rows import Levels, Search
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES
+from stereokit.kernels.threads import run, spans
 
 __all__ = ["SEARCHED_IN_FULL", "SEARCHES", "halved_levels", "plan_search", "restore_thin"]
 
@@ -46,8 +49,7 @@ def halved_levels(levels: Levels) -> Levels:
     return Levels(low, high - low)
 
 
-@kernel
-def restore_thin(selected: NDArray[np.float32], cleaned: NDArray[np.float32]) -> None:
+def restore_thin(selected: NDArray[np.float32], cleaned: NDArray[np.float32], threads: int = 1) -> None:
     """Put back into a cleaned map, in place, what cleaning took away of things that stand far in front.
 
     Poles and wires are a few pixels wide in a half-size map, where the filters take them for noise: then nobody would
@@ -60,9 +62,16 @@ def restore_thin(selected: NDArray[np.float32], cleaned: NDArray[np.float32]) ->
         The map before its post-processing.
     cleaned : (H, W) float32, pixels, no NaN
         The map after it.
+    threads : int
+        Threads to use.
     """
+    run([partial(_restore_rows, selected, y0, y1, cleaned) for y0, y1 in spans(len(selected), threads)], threads)
+
+
+@kernel
+def _restore_rows(selected: NDArray[np.float32], y0: int, y1: int, cleaned: NDArray[np.float32]) -> None:
     height, width = selected.shape
-    for y in range(height):
+    for y in range(y0, y1):
         for x in range(width):
             value = selected[y, x]
             if not value - cleaned[y, x] > np.float32(LANES // 4):
@@ -76,7 +85,9 @@ def restore_thin(selected: NDArray[np.float32], cleaned: NDArray[np.float32]) ->
                 cleaned[y, x] = value
 
 
-def plan_search(coarse: NDArray[np.float32], measured: NDArray[np.bool_], levels: Levels, search: Search) -> None:
+def plan_search(
+    coarse: NDArray[np.float32], measured: NDArray[np.bool_], levels: Levels, search: Search, threads: int = 1
+) -> None:
     """Write where each pixel searches, and what is expected there.
 
     Parameters
@@ -89,23 +100,32 @@ def plan_search(coarse: NDArray[np.float32], measured: NDArray[np.bool_], levels
         Of the full size, at least `LANES`.
     search : Search, (H, W)
         Is overwritten.
+    threads : int
+        Threads to use.
     """
+    height = coarse.shape[0]
 
-    def around(radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-        low, high = (np.asarray(extreme(coarse, kernel), np.float32) for extreme in (cv2.erode, cv2.dilate))
-        return low, high
+    def plan(y0: int, y1: int) -> None:
+        first, behind = max(y0 - _RADIUS, 0), min(y1 + _RADIUS, height)
+        part = coarse[first:behind]
 
-    _plan(coarse, measured, *around(_RADIUS), *around(1), levels.minimum, levels.count, search)
+        def around(radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+            low, high = (np.asarray(extreme(part, window), np.float32) for extreme in (cv2.erode, cv2.dilate))
+            return low[y0 - first : y1 - first], high[y0 - first : y1 - first]
+
+        _plan(coarse, measured, y0, y1, *around(_RADIUS), *around(1), levels.minimum, levels.count, search)
+
+    run([partial(plan, y0, y1) for y0, y1 in spans(height, threads)], threads)
 
 
 @kernel
 def _plan(
-    own: NDArray[np.float32], measured: NDArray[np.bool_], low: NDArray[np.float32], high: NDArray[np.float32],
-    low_3: NDArray[np.float32], high_3: NDArray[np.float32],
-    minimum: int, count: int, search: Search,
+    own: NDArray[np.float32], measured: NDArray[np.bool_], y0: int, y1: int, lows: NDArray[np.float32],
+    highs: NDArray[np.float32], lows_3: NDArray[np.float32], highs_3: NDArray[np.float32], minimum: int, count: int,
+    search: Search,
 ) -> None:  # fmt: skip
-    """Write the search for a half-size map and its lowest and highest values around each pixel.
+    """Write the search for rows y0..y1 of a half-size map and their lowest and highest values around each pixel.
 
     They are those of all pixels that the search shall hold, and of 3x3.
     """
@@ -117,19 +137,23 @@ def _plan(
     margin = np.float32(_MARGIN)
     slack = np.float32(_SLACK)
     step = np.float32(_STEP)
-    for y in range(own.shape[0]):
+    for y in range(y0, y1):
+        low = lows[y - y0]
+        high = highs[y - y0]
+        low_3 = lows_3[y - y0]
+        high_3 = highs_3[y - y0]
         for x in range(own.shape[1]):
-            begin = np.float32(2) * low[y, x] - np.float32(minimum) - margin
-            end = np.float32(2) * high[y, x] - np.float32(minimum) + margin + np.float32(2)  # a pixel is two levels
+            begin = np.float32(2) * low[x] - np.float32(minimum) - margin
+            end = np.float32(2) * high[x] - np.float32(minimum) + margin + np.float32(2)  # a pixel is two levels
             middle = np.float32(2) * own[y, x] - np.float32(minimum) - searched * np.float32(0.5)
             middle = min(max(middle, begin), max(end - searched, begin))
             spare = searched - (end - begin)
             start = begin - spare * np.float32(0.5) if spare >= zero else middle
             start = np.floor(start / step + np.float32(0.5)) * step
             start = min(max(start, zero), np.float32(count - LANES))
-            is_expected = measured[y, x] and high_3[y, x] - low_3[y, x] <= np.float32(_FLAT)
-            lowest = np.floor(np.float32(2) * low_3[y, x] - slack - np.float32(minimum) - start)
-            highest = np.ceil(np.float32(2) * high_3[y, x] + np.float32(1) + slack - np.float32(minimum) - start)
+            is_expected = measured[y, x] and high_3[x] - low_3[x] <= np.float32(_FLAT)
+            lowest = np.floor(np.float32(2) * low_3[x] - slack - np.float32(minimum) - start)
+            highest = np.ceil(np.float32(2) * high_3[x] + np.float32(1) + slack - np.float32(minimum) - start)
             right = min(2 * x + 1, width - 1)
             starts[2 * y, 2 * x] = np.int16(start)
             starts[2 * y, right] = np.int16(start)

@@ -252,7 +252,7 @@ INTERNAL = re.compile(
     r"stereokit\.(kernels|cuda|images|methods|io\.|cli\.(?!app))"
     r"|stereokit_refiners\.runtimes\.(openvino|onnx|onnx_file|opencv|torch|reference|evidence|mixture)"
     r"|stereokit\.aggregation\.paths"
-    r"|stereokit_evaluation\.(commands\.(?!search)|common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes|generated))"
+    r"|stereokit_evaluation\.(commands\.(?!search)|common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes|generated|assets))"
     r"|.*_cuda$"
 )
 """Modules that only this project uses, and commands, whose help is on the page of the command line."""

@@ -289,7 +289,7 @@ def _produce_rows(
     like = row[0]
     unit = splat(row.dtype.type(1 << _FRACTION_BITS if row.itemsize == 2 else 1))
     for y in range(y0, y1):
-        cost_row(rows, y, cost)
+        cost_row(rows, y, 0, guide.shape[1], cost)
         for at in range(0, size, LANES):
             store(row, at, multiply(convert(load(cost, at), like), unit))
         _filter_row(blocks, guide, weights, y, 0, row)

@@ -6,13 +6,19 @@ cost volume is stored (`stereokit.aggregation.paths` has the picture).
 
 The down sweep visits the upper half first while the up sweep visits the lower half; each leaves the sum of its
 three paths. Then each goes on into the half where the other has been, adds the other's sums and the two paths
-along the row, and selects. The two never meet in a row, so two threads give what one thread gives, bit for bit.
+along the row, and selects. The two never meet in a row.
+
+With 4 paths any number of threads takes part, and gives what one gives, bit for bit. Of the first visits each takes a
+band of columns, which the vertical path never leaves. In the last visits it claims two rows at a time: it walks the
+paths along them by itself, then the vertical one from block to block behind the thread that has the rows before.
+Diagonal paths leave every band and reach ahead, so 8 paths use two threads, and 5 paths, which have one sweep, one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -35,8 +41,9 @@ from stereokit.errors import OptionError
 from stereokit.images.check import check_integer, check_number
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES, load, store
-from stereokit.kernels.threads import run_stages
-from stereokit.kernels.trace import span
+from stereokit.kernels.spin import WORDS_APART, claim, publish, wait_until
+from stereokit.kernels.threads import run_stages, spans
+from stereokit.kernels.trace import runner, span
 from stereokit.kernels.workspace import Workspace
 from stereokit.registry import AGGREGATIONS
 from stereokit.selection.wta import SelectionOutput, select_row
@@ -45,6 +52,9 @@ __all__ = ["Sgm"]
 
 NEAR = 4 << 20
 """Elements that a first visit writes last and leaves in the caches: the last visits begin where the first ones end."""
+
+BLOCK = 2 * CHUNK
+"""Columns of two rows that a last visit does before it lets the next two rows follow."""
 
 
 @AGGREGATIONS.register("sgm")
@@ -138,7 +148,7 @@ class Sgm:
         workspace : Workspace
             Buffers.
         threads : int
-            1 or more; two are used.
+            1 or more. All are used with 4 paths, two with 8, one with 5.
         out : SelectionOutput
             Maps of the selection.
         total : (H, W, P) uint16 or None
@@ -149,60 +159,59 @@ class Sgm:
         if search is not None:
             self._narrow_sweep(rows, search, cost, guide, workspace, threads, out)
             return
-        height = guide.shape[0]
-        key = self, guide.shape, levels, cost.cost_max, cost.unit, cost.costly_to_recompute
-        penalties, sums, workers = workspace.cached(
-            "sgm", key, lambda: self._buffers(guide.shape, levels, cost, workspace)
-        )
+        penalties, sums, sweeps = self._cached(guide.shape, levels, cost, workspace, threads)
         total_out = np.empty(0, np.uint16) if total is None else total.reshape(-1)
-        if len(workers) == 1:
-            start(workers[0])
-            _last_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out, total_out)
-            return
+        if len(sweeps) == 1:
+            start(sweeps[0][0], 0, guide.shape[1])
 
-        def first(k: int, y0: int, y1: int) -> None:
-            start(workers[k])
-            first_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
+        def first(sweep: int, k: int, part: _Part) -> None:
+            first_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, NEAR)
 
-        def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
-            _last_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out, total_out)
+        def last(sweep: int, k: int, part: _Part, words: NDArray[np.int64]) -> None:
+            both = len(sweeps) == 2
+            _last_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, both, out, total_out, words)
 
-        _meet(first, last, height, threads)
+        _meet(first, last, guide.shape, len(sweeps), len(sweeps[0]), self.paths == 4, threads)
 
     def _narrow_sweep(
         self, rows: list[Any], search: Search, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
         threads: int, out: SelectionOutput,
     ) -> None:  # fmt: skip
         """Aggregate and select where each pixel has a search of its own."""
-        height = guide.shape[0]
-        key = self, guide.shape, cost.cost_max, cost.unit, "narrow"
-        penalties, sums, paths = workspace.cached(
-            "sgm", key, lambda: self._buffers(guide.shape, Levels(0, LANES), cost, workspace, LANES)
-        )
+        penalties, sums, paths = self._cached(guide.shape, Levels(0, LANES), cost, workspace, threads, LANES)
         edges = np.full(3 * LANES, 255, np.uint8)
         edges[LANES : 2 * LANES] = 0
         below, above = np.zeros((2, 2 * LANES), np.uint8)
         below[:LANES] = above[LANES + 1 :] = UNEXPECTED
         flat = Search(search.starts.ravel(), search.low.ravel(), search.high.ravel())
-        workers = [NarrowBuffers(buffers, flat, edges, below, above) for buffers in paths]
-        if len(workers) == 1:
-            start_narrow(workers[0])
-            _last_narrow_visit(rows[0], workers[0], guide, penalties, 0, height, 1, 0, sums, False, out)
-            return
+        sweeps = [[NarrowBuffers(buffers, flat, edges, below, above) for buffers in workers] for workers in paths]
+        if len(sweeps) == 1:
+            start_narrow(sweeps[0][0], 0, guide.shape[1])
 
-        def first(k: int, y0: int, y1: int) -> None:
-            start_narrow(workers[k])
-            first_narrow_visit(rows[k], workers[k], guide, penalties, y0, y1, sums, NEAR)
+        def first(sweep: int, k: int, part: _Part) -> None:
+            first_narrow_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, NEAR)
 
-        def last(k: int, y0: int, y1: int, step: int, visited: int) -> None:
-            _last_narrow_visit(rows[k], workers[k], guide, penalties, y0, y1, step, visited, sums, True, out)
+        def last(sweep: int, k: int, part: _Part, words: NDArray[np.int64]) -> None:
+            both = len(sweeps) == 2
+            _last_narrow_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, both, out, words)
 
-        _meet(first, last, height, threads)
+        _meet(first, last, guide.shape, len(sweeps), len(sweeps[0]), self.paths == 4, threads)
+
+    def _cached(
+        self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace, threads: int, margin: int = 0
+    ) -> tuple[Penalties, NDArray[Any], list[list[PathBuffers]]]:
+        """Return what `_buffers` makes, from the call before if it fits."""
+        workers = {4: min(threads, -(-shape[0] // 4)), 5: 1, 8: 2}[self.paths]
+        key = self, shape, levels, cost.cost_max, cost.unit, cost.costly_to_recompute, margin, workers
+        return workspace.cached("sgm", key, lambda: self._buffers(shape, levels, cost, workspace, workers, margin))
 
     def _buffers(
-        self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace, margin: int = 0
-    ) -> tuple[Penalties, NDArray[Any], list[PathBuffers]]:
-        """Return the penalties, the volume of sums and the buffers of each sweep, with a margin around path costs."""
+        self, shape: tuple[int, int], levels: Levels, cost: Cost, workspace: Workspace, workers: int, margin: int
+    ) -> tuple[Penalties, NDArray[Any], list[list[PathBuffers]]]:
+        """Return the penalties, the volume of sums and the buffers of each sweep for each worker.
+
+        There is a `margin` around path costs.
+        """
         unexpected = UNEXPECTED if margin else 0
         cost_max = cost.cost_max + unexpected
         penalties = self.penalties(cost.cost_max, cost.unit, unexpected)
@@ -219,7 +228,7 @@ class Sgm:
         whole = levels.count == levels.padded  # or the 255 of levels that pad would wrap, and might win
         padding = np.zeros(levels.padded, np.uint8)
         padding[levels.count :] = WORST
-        workers = [
+        buffers = [
             PathBuffers(
                 blocks=tuple(range(levels.padded // LANES)),
                 diagonals=(0,) if diagonals else (),
@@ -230,74 +239,156 @@ class Sgm:
                 cost=workspace.array(f"sgm.cost{k}", 2 * size, np.uint8),
                 across=workspace.array(f"sgm.across{k}", 2 * size, across_dtype),
                 chains=workspace.array(f"sgm.chains{k}", 4 * levels.padded + 2 * margin, np.uint8),
-                state=workspace.array(f"sgm.state{k}", 3 * size + 2 * margin, np.uint8),
-                lowest=workspace.array(f"sgm.lowest{k}", 3 * width, np.uint8),
+                state=np.empty(0, np.uint8),  # of a sweep
+                lowest=np.empty(0, np.uint8),
                 penalties=workspace.array(f"sgm.penalties{k}", 16 * width, np.uint8),
                 total=workspace.array(f"sgm.total{k}", CHUNK * levels.padded, np.uint16),
                 path_minimum=path_minimum,
                 padding=padding,
             )
-            for k in range(2 if two_sweeps else 1)
+            for k in range(workers)
         ]
-        return penalties, sums, workers
+        sweeps = []
+        for sweep in range(2 if two_sweeps else 1):
+            state = workspace.array(f"sgm.state{sweep}", 3 * size + 2 * margin, np.uint8)
+            lowest = workspace.array(f"sgm.lowest{sweep}", 3 * width, np.uint8)
+            sweeps.append([one._replace(state=state, lowest=lowest) for one in buffers])
+        return penalties, sums, sweeps
 
 
-def _meet(first: Callable[..., None], last: Callable[..., None], height: int, threads: int) -> None:
-    """Let the down and the up sweep visit their own half of the rows first, and the other's last."""
-    middle = height // 2
+_Part = tuple[int, int, int, int]
+"""What a visit works on: `_meet` says what the numbers are."""
 
-    def visit(name: str, function: Callable[..., None], *args: Any) -> None:
-        with span("match", name):
-            function(*args)
 
-    begin, end = (partial(visit, "sweep: first visit", first), partial(visit, "sweep: last visit", last))
-    run_stages(
-        [
-            [partial(begin, 0, 0, middle), partial(begin, 1, height - 1, middle - 1)],
-            [partial(end, 0, middle, height, 1, middle), partial(end, 1, middle - 1, -1, -1, height - middle)],
-        ],
-        threads,
-    )
+def _meet(
+    first: Callable[..., None], last: Callable[..., None], shape: tuple[int, int], sweeps: int, workers: int,
+    free: bool, threads: int,
+) -> None:  # fmt: skip
+    """Let the down and the up sweep visit their own half of the rows first, and the other's last.
+
+    Parameters
+    ----------
+    first : callable
+        ``first(sweep, worker, part)``, part of `first_visit`: y0, y1, x0, x1.
+    last : callable
+        ``last(sweep, worker, part, words)``, part of `_last_visit`: y0, y1, step, k0.
+    shape : (int, int)
+    sweeps : {1, 2}
+        One visits all rows, last.
+    workers, threads : int
+    free : bool
+        Whether workers may share a sweep; else each has its own.
+    """
+    height, width = shape
+    middle = height // 2 if sweeps == 2 else 0
+    ways = [(0, middle), (height - 1, middle - 1)][: sweeps if sweeps == 2 else 0]
+    parts = [(middle, height, 1, middle), (middle - 1, -1, -1, height - middle)][:sweeps]
+    shares = workers if workers % 2 else workers // 2  # of each sweep: no worker has more to do than another
+    bands = spans(width, min(shares, width // CHUNK)) if free and workers > 1 else [(0, width)]
+    idle = deque(range(workers))
+
+    def begin(sweep: int, part: _Part) -> None:
+        with span("match", "sweep: first visit"):
+            k = idle.popleft() if free else sweep
+            first(sweep, k, part)
+            if free:
+                idle.append(k)
+
+    def end(sweep: int, k: int, part: _Part, words: NDArray[np.int64]) -> None:
+        with span("match", "sweep: last visit"):
+            last(sweep, k, part, words)
+
+    def words_for(rows: int) -> NDArray[np.int64]:
+        return np.zeros((2 + rows // 2) * WORDS_APART, np.int64)
+
+    begins = [partial(begin, sweep, (*way, *band)) for band in bands for sweep, way in enumerate(ways)]
+    if (own := runner()) is not None:
+        own.side_by_side(begins)
+
+        def line(sweep: int) -> Iterator[Callable[[], None]]:
+            return (partial(end, sweep, sweep % workers, pair, words_for(2)) for pair in _pairs(parts[sweep]))
+
+        own.in_line([line(sweep) for sweep in range(sweeps)], -(-width // BLOCK), free)
+        return
+    words = [words_for(height) for _ in parts]
+
+    def end_all(k: int) -> None:
+        for n in range(sweeps) if free else (0,):
+            sweep = (n + k) % sweeps
+            end(sweep, k, parts[sweep], words[sweep])
+
+    run_stages([begins, [partial(end_all, k) for k in range(workers)]], min(threads, workers))
+
+
+def _pairs(part: _Part) -> Iterator[_Part]:
+    """Yield the pairs of rows of a last visit, each as a last visit of its own."""
+    y0, y1, step, visited = part
+    for k in range(0, abs(y1 - y0), 2):
+        last = y0 + (k + 2) * step
+        yield y0 + k * step, last if (last - y1) * step < 0 else y1, step, visited + k
 
 
 @kernel
 def _last_narrow_visit(
     rows: Any, buffers: NarrowBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, step: int,
-    k0: int, sums: NDArray[Any], both: bool, out: SelectionOutput,
+    k0: int, sums: NDArray[Any], both: bool, out: SelectionOutput, words: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Sweep from row `y0` to before row `y1`, sum all paths and select; `k0` rows came before in this sweep."""
+    """Sweep, sum all paths and select; see `_last_visit`."""
     paths = buffers.paths
-    for k in range(abs(y1 - y0)):
-        y = y0 + k * step
-        half = k % 2
-        if half == 0:
-            prepare_narrow_rows(rows, buffers, guide, penalties, y, step, min(2, abs(y1 - y0) - k))
-        for x0 in range(0, paths.width, CHUNK):
-            x1 = min(x0 + CHUNK, paths.width)
-            finish_narrow_part(buffers, guide, half, y, step, k0 + k, x0, x1, sums, both)
-            select_row(paths.total, paths.total, x1 - x0, paths.blocks, y * paths.width + x0, out)
+    visits = abs(y1 - y0)
+    columns = paths.width if len(paths.diagonals) > 0 else BLOCK  # diagonal paths reach ahead into the next block
+    while True:
+        pair = claim(words, 0)
+        k = 2 * pair
+        if k >= visits:
+            break
+        count = min(2, visits - k)
+        prepare_narrow_rows(rows, buffers, guide, penalties, y0 + k * step, step, count)
+        for block in range(0, paths.width, columns):
+            end = min(block + columns, paths.width)
+            if pair > 0:
+                wait_until(words, pair * WORDS_APART, end)
+            for half in range(count):
+                y = y0 + (k + half) * step
+                for x0 in range(block, end, CHUNK):
+                    x1 = min(x0 + CHUNK, end)
+                    finish_narrow_part(buffers, guide, half, y, step, k0 + k + half, x0, x1, sums, both)
+                    select_row(paths.total, paths.total, x1 - x0, paths.blocks, y * paths.width + x0, out)
+            publish(words, (pair + 1) * WORDS_APART, end)
 
 
 @kernel
 def _last_visit(
     rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, step: int,
-    k0: int, sums: NDArray[Any], both: bool, out: SelectionOutput, total: NDArray[np.uint16],
+    k0: int, sums: NDArray[Any], both: bool, out: SelectionOutput, total: NDArray[np.uint16], words: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Sweep from row `y0` to before row `y1`, sum all paths and select; `k0` rows came before in this sweep.
 
     If there are `both` sweeps, the other one left its part in `sums`. The sums also go to `total`, unless it is empty.
+    Workers that share the sweep share `words`, which begin as zeros: the first counts the pairs of rows that were
+    claimed, each of the others says how many columns of a pair are done.
     """
     padded = LANES * len(buffers.blocks)
     visits = abs(y1 - y0)
-    for k in range(visits):
-        y = y0 + k * step
-        half = k % 2
-        if half == 0:
-            prepare_rows(rows, buffers, guide, penalties, y, step, min(2, visits - k), sums)
-        for x0 in range(0, buffers.width, CHUNK):
-            x1 = min(x0 + CHUNK, buffers.width)
-            finish_part(buffers, half, y, k0 + k, x0, x1, sums, both)
-            if total.size > 0:
-                for at in range(0, (x1 - x0) * padded, LANES):
-                    store(total, (y * buffers.width + x0) * padded + at, load(buffers.total, at))
-            select_row(buffers.total, buffers.total, x1 - x0, buffers.blocks, y * buffers.width + x0, out)
+    columns = buffers.width if len(buffers.diagonals) > 0 else BLOCK  # diagonal paths reach ahead into the next block
+    while True:
+        pair = claim(words, 0)
+        k = 2 * pair
+        if k >= visits:
+            break
+        count = min(2, visits - k)
+        prepare_rows(rows, buffers, guide, penalties, y0 + k * step, step, count, sums)
+        for block in range(0, buffers.width, columns):
+            end = min(block + columns, buffers.width)
+            if pair > 0:
+                wait_until(words, pair * WORDS_APART, end)
+            for half in range(count):
+                y = y0 + (k + half) * step
+                for x0 in range(block, end, CHUNK):
+                    x1 = min(x0 + CHUNK, end)
+                    finish_part(buffers, half, y, k0 + k + half, x0, x1, sums, both)
+                    if total.size > 0:
+                        for at in range(0, (x1 - x0) * padded, LANES):
+                            store(total, (y * buffers.width + x0) * padded + at, load(buffers.total, at))
+                    select_row(buffers.total, buffers.total, x1 - x0, buffers.blocks, y * buffers.width + x0, out)
+            publish(words, (pair + 1) * WORDS_APART, end)

@@ -145,12 +145,12 @@ def _transform(
 
 @implements(CensusRows)
 @kernel
-def _census_row(rows: CensusRows, y: int, out: NDArray[np.uint8]) -> None:
+def _census_row(rows: CensusRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
     cells = rows.cells
     planes = len(rows.planes)
     left = y * planes * rows.left_stride
     right = y * planes * rows.right_stride
-    for x in range(cells.width):
+    for x in range(x0, x1):
         k = cells.width - 1 - x
         for n in range(len(cells.blocks)):
             block = n * LANES
@@ -160,18 +160,18 @@ def _census_row(rows: CensusRows, y: int, out: NDArray[np.uint8]) -> None:
                 right_bits = load(rows.right, right + p * rows.right_stride + k + block)
                 cost = add(cost, count_bits(xor(left_bits, right_bits)))
             store(out, x * LANES * len(cells.blocks) + block, cost)
-    mask_row(cells, y, out)
+    mask_row(cells, y, x0, x1, out)
 
 
 @implements(NarrowCensusRows)
 @kernel
-def _narrow_census_row(rows: NarrowCensusRows, y: int, out: NDArray[np.uint8]) -> None:
+def _narrow_census_row(rows: NarrowCensusRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
     planes = rows.planes
     width = planes.cells.width
     count = len(planes.planes)
     left = y * count * planes.left_stride
     right = y * count * planes.right_stride
-    for x in range(width):
+    for x in range(x0, x1):
         k = width - 1 - x + np.int64(rows.starts[y * width + x])
         cost = splat(np.uint8(0))
         for p in range(count):
@@ -179,4 +179,4 @@ def _narrow_census_row(rows: NarrowCensusRows, y: int, out: NDArray[np.uint8]) -
             right_bits = load(planes.right, right + p * planes.right_stride + k)
             cost = add(cost, count_bits(xor(left_bits, right_bits)))
         store(out, x * LANES, cost)
-    mask_narrow_row(planes.cells, rows.starts, y, out)
+    mask_narrow_row(planes.cells, rows.starts, y, x0, x1, out)

@@ -1,8 +1,8 @@
 """The common part of all costs: levels of disparity, padded images, and the mask of the cells without evidence.
 
 A cost is a *producer of rows*. It prepares an image pair once and returns, for each worker, a named tuple of
-arrays; `cost_row` then writes the costs of row `y`, ``(W, P)`` ``uint8``, disparity innermost, when a sweep asks
-for it. Costs are cheap to compute again, so the cost volume is never stored.
+arrays; `cost_row` then writes the costs of a part of row `y`, ``(W, P)`` ``uint8``, disparity innermost, when a sweep
+asks for it. Costs are cheap to compute again, so the cost volume is never stored.
 
 The *type* of the named tuple decides, when a sweep is compiled, which code `cost_row` runs (see
 `implements`): two producers times two sweeps are four specialisations of one source, and a third cost is one
@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.kernels.jit import by_types, inline, kernel
-from stereokit.kernels.simd import LANES, bitwise_or, load, maximum, minimum, splat, store
+from stereokit.kernels.simd import LANES, aligned, bitwise_or, load, maximum, minimum, splat, store
 from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
@@ -174,10 +174,13 @@ _PRODUCERS: dict[type, Callable[..., None]] = {}
 
 
 @by_types
-def cost_row(rows: Any, y: Any, out: Any) -> Any:
-    """Write the costs of image row `y` into the flat ``uint8`` array `out` (``W * P``); compiled code only."""
+def cost_row(rows: Any, y: Any, x0: Any, x1: Any, out: Any) -> Any:
+    """Write the costs of columns x0..x1 of row `y` to their places in the flat ``uint8`` row `out` (``W * P``).
+
+    Compiled code only.
+    """
     function = _PRODUCERS[rows.instance_class]
-    return lambda rows, y, out: function(rows, y, out)
+    return lambda rows, y, x0, x1, out: function(rows, y, x0, x1, out)
 
 
 def implements(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -191,21 +194,22 @@ def implements(kind: type) -> Callable[[Callable[..., None]], Callable[..., None
 
 
 def cell_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
-    """Return the cells of `pair` without evidence, for costs of ``0..cost_max``; cached where no pixel is invalid."""
-    if pair.left_bad is not None or pair.right_bad is not None:
-        return _new_mask(pair, cost_max, Workspace())
-    key = pair.left.shape, pair.levels, pair.border_share, cost_max
-    return workspace.cached("cells", key, lambda: _new_mask(pair, cost_max, Workspace()))
+    """Return the cells of `pair` without evidence, for costs of ``0..cost_max``; cached but for the invalid pixels."""
+    if pair.right_bad is not None:
+        cells = _new_mask(pair, cost_max)
+    else:
+        key = pair.left.shape, pair.levels, pair.border_share, cost_max
+        cells = workspace.cached("cells", key, lambda: _new_mask(pair, cost_max))
+    return cells if pair.left_bad is None else cells._replace(left_bad=pair.left_bad.view(np.uint8).ravel())
 
 
-def _new_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
+def _new_mask(pair: CostInput, cost_max: int) -> CellMask:
     height, width = pair.left.shape
     levels = pair.levels
     border_cost = np.uint8(cost_max if pair.border_share is None else round(pair.border_share * cost_max))
     stride = width + levels.padded
     shared = pair.right_bad is None
-    low = workspace.array("cells.low", (1 if shared else height, stride), np.uint8)
-    high = workspace.array("cells.high", low.shape, np.uint8)
+    low, high = (aligned((1 if shared else height, stride), np.uint8) for _ in range(2))
     columns = width - 1 - levels.minimum - np.arange(stride)
     inside = (columns >= 0) & (columns < width)
     evidence = np.broadcast_to(inside | (pair.border_share is None), low.shape)
@@ -213,8 +217,7 @@ def _new_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
         evidence = evidence & ~pair.right_bad[:, np.clip(columns, 0, width - 1)]
     low[...] = np.where(evidence, 0, border_cost)
     high[...] = np.where(evidence, 255, border_cost)
-    left_bad = np.empty(0, np.uint8) if pair.left_bad is None else pair.left_bad.view(np.uint8).ravel()
-    padding = workspace.array("cells.padding", levels.padded, np.uint8)
+    padding = aligned((levels.padded,), np.uint8)
     padding[: levels.count] = 0
     padding[levels.count :] = WORST
     return CellMask(
@@ -226,7 +229,7 @@ def _new_mask(pair: CostInput, cost_max: int, workspace: Workspace) -> CellMask:
         low=low.ravel(),
         high=high.ravel(),
         stride=0 if shared else stride,
-        left_bad=left_bad,
+        left_bad=np.empty(0, np.uint8),
         padding=padding,
     )
 
@@ -242,32 +245,34 @@ def _clamp_cells(cells: CellMask, y: int, x: int, out: NDArray[np.uint8]) -> Non
 
 
 @kernel
-def mask_row(cells: CellMask, y: int, out: NDArray[np.uint8]) -> None:
-    """Set the cells of row `y` without evidence to the border's cost, and the levels that pad to the worst."""
+def mask_row(cells: CellMask, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
+    """Set the cells of a part of a row without evidence to the border's cost, and the levels that pad to the worst."""
     if cells.stride > 0:
-        for x in range(cells.width):
+        for x in range(x0, x1):
             _clamp_cells(cells, y, x, out)
     else:
-        for x in range(min(cells.width, max(0, cells.padded - 1 + cells.minimum))):
+        for x in range(x0, min(x1, max(0, cells.padded - 1 + cells.minimum))):
             _clamp_cells(cells, y, x, out)
-        for x in range(max(0, cells.width + min(cells.minimum, 0)), cells.width):
+        for x in range(max(x0, cells.width + min(cells.minimum, 0)), x1):
             _clamp_cells(cells, y, x, out)
     if cells.left_bad.size > 0:
-        for x in range(cells.width):
+        for x in range(x0, x1):
             if cells.left_bad[y * cells.width + x] != 0:
                 for block in range(0, cells.padded, LANES):
                     store(out, x * cells.padded + block, splat(cells.border_cost))
     if cells.padding[cells.padded - 1] != 0:
         last = cells.padded - LANES
         padding = load(cells.padding, last)
-        for x in range(cells.width):
+        for x in range(x0, x1):
             store(out, x * cells.padded + last, bitwise_or(load(out, x * cells.padded + last), padding))
 
 
 @kernel
-def mask_narrow_row(cells: CellMask, starts: NDArray[np.int16], y: int, out: NDArray[np.uint8]) -> None:
-    """Set the cells of row `y` without evidence to the border's cost; a pixel has the `LANES` levels from its start."""
-    for x in range(cells.width):
+def mask_narrow_row(
+    cells: CellMask, starts: NDArray[np.int16], y: int, x0: int, x1: int, out: NDArray[np.uint8]
+) -> None:
+    """Set the cells of a part of a row without evidence to the border's cost; a pixel has `LANES` levels."""
+    for x in range(x0, x1):
         start = np.int64(starts[y * cells.width + x])
         column = x - cells.minimum - start  # right column of the first level
         at = x * LANES
@@ -323,14 +328,15 @@ def produce_volume(rows: list[Any], shape: tuple[int, int], levels: Levels, thre
     height, width = shape
     padded = np.empty((height, width * levels.padded), np.uint8)
     parts = spans(height, threads)
-    run([partial(_produce, rows[k], y0, y1, padded) for k, (y0, y1) in enumerate(parts)], threads)
+    run([partial(_produce, rows[k], y0, y1, levels.padded, padded) for k, (y0, y1) in enumerate(parts)], threads)
     return np.ascontiguousarray(padded.reshape(height, width, levels.padded)[:, :, : levels.count])
 
 
 @kernel
-def _produce(rows: Any, y0: int, y1: int, out: NDArray[np.uint8]) -> None:
+def _produce(rows: Any, y0: int, y1: int, padded: int, out: NDArray[np.uint8]) -> None:
     for y in range(y0, y1):
-        cost_row(rows, y, out[y])
+        row = out[y]
+        cost_row(rows, y, 0, row.size // padded, row)
 
 
 class VolumeRows(NamedTuple):
@@ -342,9 +348,9 @@ class VolumeRows(NamedTuple):
 
 @implements(VolumeRows)
 @kernel
-def _volume_row(rows: VolumeRows, y: int, out: NDArray[np.uint8]) -> None:
-    _, width, count = rows.volume.shape
-    for x in range(width):
+def _volume_row(rows: VolumeRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
+    _, _, count = rows.volume.shape
+    for x in range(x0, x1):
         for d in range(count):
             out[x * rows.padded + d] = rows.volume[y, x, d]
         for d in range(count, rows.padded):

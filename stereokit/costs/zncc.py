@@ -79,7 +79,7 @@ class Statistics(NamedTuple):
 class ColumnSums(NamedTuple):
     """Sums of products over the columns of the windows around one row, which slide with it; of one worker."""
 
-    row: NDArray[np.int64]  # (1,): that row, or -1
+    row: NDArray[np.int64]  # (3,): that row, or -1, the first column and the one behind the last
     sums: NDArray[np.int32]  # n times the sums, element ((d // 64) * C + half + x) * 64 + d % 64
     factors: NDArray[np.int32]  # n * left pixels of the row that comes (low half), -n * those of the one that goes
     pairs: NDArray[np.int32]  # right pixels of the row that comes (low half) and of the one that goes (high half)
@@ -217,7 +217,7 @@ class Zncc:
         sums, pairs = ((width + 2 * half) * padded, 1) if pair.starts is None else (self.window * LANES, half + 1)
         for worker in range(workers):
             columns = ColumnSums(
-                row=workspace.array(f"zncc.row{worker}", 1, np.int64),
+                row=workspace.array(f"zncc.row{worker}", 3, np.int64),
                 sums=workspace.array(f"zncc.sums{worker}", sums, np.int32),
                 factors=workspace.array(f"zncc.factors{worker}", pairs * (width + 2 * half), np.int32),
                 pairs=workspace.array(f"zncc.pairs{worker}", pairs * (right_width + 2 * half), np.int32),
@@ -313,35 +313,46 @@ def _statistics(
 
 
 @inline
-def _write_pairs(rows: ZnccRows, place: int, low_row: int, high_row: int, low_n: int, high_n: int) -> None:
+def _write_pairs(
+    rows: ZnccRows, x0: int, x1: int, place: int, low_row: int, high_row: int, low_n: int, high_n: int
+) -> None:
     """Write two rows of the padded right image into the halves of lanes, and those of the left one times a factor.
 
-    `place` counts pairs of rows; a row that is -1 is none.
+    What the windows around columns x0..x1 need of them. `place` counts pairs of rows; a row that is -1 is none.
     """
     images = rows.images
-    new = max(low_row, 0) * images.right_stride
-    old = max(high_row, 0) * images.right_stride
-    at = place * images.right_stride
-    for k in range(images.right_stride):
-        low = np.int32(images.right[new + k]) & np.int32(0xFFFF)
-        high = np.int32(np.int32(images.right[old + k]) << np.int32(16))
-        rows.columns.pairs[at + k] = np.int32(low | high)
-    new = max(low_row, 0) * images.left_stride
-    old = max(high_row, 0) * images.left_stride
-    at = place * images.left_stride
+    first = rows.cells.width - x1  # right pixel of level 0 of the last column
+    count = min(x1 - x0 + rows.cells.padded + 2 * rows.half, images.right_stride - first)
+    new = max(low_row, 0) * images.right_stride + first
+    old = max(high_row, 0) * images.right_stride + first
+    at = place * images.right_stride + first
+    right_low = images.right[new : new + count]
+    right_high = images.right[old : old + count]
+    pairs = rows.columns.pairs[at : at + count]
+    for k in range(count):
+        low = np.int32(right_low[k]) & np.int32(0xFFFF)
+        high = np.int32(np.int32(right_high[k]) << np.int32(16))
+        pairs[k] = np.int32(low | high)
+    count = x1 - x0 + 2 * rows.half
+    new = max(low_row, 0) * images.left_stride + x0
+    old = max(high_row, 0) * images.left_stride + x0
+    at = place * images.left_stride + x0
     n_low = np.int32(low_n) if low_row >= 0 else np.int32(0)
     n_high = np.int32(high_n) if high_row >= 0 else np.int32(0)
-    for c in range(images.left_stride):
-        low = np.int32(n_low * np.int32(images.left[new + c])) & np.int32(0xFFFF)
-        high = np.int32(np.int32(n_high * np.int32(images.left[old + c])) << np.int32(16))
-        rows.columns.factors[at + c] = np.int32(low | high)
+    left_low = images.left[new : new + count]
+    left_high = images.left[old : old + count]
+    factors = rows.columns.factors[at : at + count]
+    for c in range(count):
+        low = np.int32(n_low * np.int32(left_low[c])) & np.int32(0xFFFF)
+        high = np.int32(np.int32(n_high * np.int32(left_high[c])) << np.int32(16))
+        factors[c] = np.int32(low | high)
 
 
 @inline
-def _pair_rows(rows: ZnccRows, row_in: int, row_out: int) -> None:
+def _pair_rows(rows: ZnccRows, x0: int, x1: int, row_in: int, row_out: int) -> None:
     """Fill `pairs` and `factors` for a row of the padded images that comes and one that goes; -1 is none."""
     n = (2 * rows.half + 1) ** 2
-    _write_pairs(rows, 0, row_in, row_out, n, -n)
+    _write_pairs(rows, x0, x1, 0, row_in, row_out, n, -n)
 
 
 @inline
@@ -354,15 +365,16 @@ def _column(rows: ZnccRows, at: int, c: int, block: int) -> Any:
 
 
 @inline
-def _start_sums(rows: ZnccRows, y: int) -> None:
-    """Fill the column sums with all rows of the window around row `y` but the last."""
+def _start_sums(rows: ZnccRows, y: int, x0: int, x1: int) -> None:
+    """Fill the column sums of columns x0..x1 with all rows of the window around row `y` but the last."""
     columns = rows.columns.factors.size
-    for at in range(0, rows.columns.sums.size, LANES):
-        store(rows.columns.sums, at, splat(np.int32(0)))
+    for n in range(len(rows.cells.blocks)):
+        for c in range(x0, x1 + 2 * rows.half):
+            store(rows.columns.sums, (n * columns + c) * LANES, splat(np.int32(0)))
     for row in range(y, y + 2 * rows.half):
-        _pair_rows(rows, row, -1)
+        _pair_rows(rows, x0, x1, row, -1)
         for n in range(len(rows.cells.blocks)):
-            for c in range(columns):
+            for c in range(x0, x1 + 2 * rows.half):
                 _column(rows, (n * columns + c) * LANES, c, n * LANES)
 
 
@@ -395,10 +407,11 @@ def _cost_of(rows: ZnccRows, y: int, x: int, k: int, total: Any) -> Any:
 
 @implements(ZnccRows)
 @kernel
-def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
+def _zncc_row(rows: ZnccRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
     cells = rows.cells
     window = 2 * rows.half + 1
-    last = rows.columns.row[0]
+    state = rows.columns.row
+    last = state[0] if state[1] == x0 and state[2] == x1 else np.int64(-1)
     row_in = np.int64(-1)  # of the padded image: row y of it is the top of the window around row y
     row_out = np.int64(-1)
     if last >= 0 and y == last + 1:
@@ -408,10 +421,12 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
         row_in = np.int64(y)
         row_out = last + window - 1
     elif y != last:
-        _start_sums(rows, y)
+        _start_sums(rows, y, x0, x1)
         row_in = y + window - 1
-    rows.columns.row[0] = y
-    _pair_rows(rows, row_in, row_out)
+    state[0] = y
+    state[1] = x0
+    state[2] = x1
+    _pair_rows(rows, x0, x1, row_in, row_out)
     padded = LANES * len(cells.blocks)
     columns = cells.width + window - 1
     for n in range(len(cells.blocks)):
@@ -419,15 +434,15 @@ def _zncc_row(rows: ZnccRows, y: int, out: NDArray[np.uint8]) -> None:
         base = n * columns * LANES
         # One pass: a column's sum is brought to this row, then it enters the window and the oldest leaves.
         total = splat(np.int32(0))
-        for c in range(window - 1):
+        for c in range(x0, x0 + window - 1):
             total = add(total, _column(rows, base + c * LANES, c, block))
-        for x in range(cells.width):
+        for x in range(x0, x1):
             at = base + x * LANES  # of the oldest column
             total = add(total, _column(rows, at + (window - 1) * LANES, x + window - 1, block))
             k = y * rows.statistics.right_width + cells.width - 1 - x + block
             store(out, x * padded + block, _cost_of(rows, y, x, k, total))
             total = subtract(total, load(rows.columns.sums, at))
-    mask_row(cells, y, out)
+    mask_row(cells, y, x0, x1, out)
 
 
 @inline
@@ -443,17 +458,17 @@ def _narrow_column(rows: ZnccRows, c: int, start: int) -> Any:
 
 @implements(NarrowZnccRows)
 @kernel
-def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, out: NDArray[np.uint8]) -> None:
+def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) -> None:
     rows = narrow.window
     cells = rows.cells
     window = 2 * rows.half + 1
     n = window * window
     for pair in range(rows.half + 1):
-        _write_pairs(rows, pair, y + 2 * pair, y + 2 * pair + 1 if pair < rows.half else -1, n, n)
+        _write_pairs(rows, x0, x1, pair, y + 2 * pair, y + 2 * pair + 1 if pair < rows.half else -1, n, n)
     sums = rows.columns.sums
     before = np.int64(-1)
     total = splat(np.int32(0))
-    for x in range(cells.width):
+    for x in range(x0, x1):
         start = np.int64(narrow.starts[y * cells.width + x])
         if start == before:  # the window slides: its oldest column leaves, in whose place the next one is kept
             at = (x - 1) % window * LANES
@@ -469,4 +484,4 @@ def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, out: NDArray[np.uint8]) -> 
         before = start
         k = y * rows.statistics.right_width + cells.width - 1 - x + start
         store(out, x * LANES, _cost_of(rows, y, x, k, total))
-    mask_narrow_row(cells, narrow.starts, y, out)
+    mask_narrow_row(cells, narrow.starts, y, x0, x1, out)

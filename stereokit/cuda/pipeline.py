@@ -146,7 +146,7 @@ class CudaPipeline:
         """Return a pipeline whose settings differ in some values."""
         return CudaPipeline(self.settings.replaced(**changes))
 
-    def nbytes(self, height: int, width: int, dtype: Any = np.uint8) -> float:
+    def nbytes(self, height: int, width: int, dtype: Any = np.uint8, threads: int = 1) -> float:
         """Return the bytes of buffers that a pair takes on the device; see `stereokit.pipeline.Pipeline`."""
         queue = DryQueue()
         dtype = np.dtype(dtype)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stereokit.errors import InputError, shown
 
-__all__ = ["SMALLEST_BORDER", "THICK", "black_border", "blank_pixels", "checked_mask", "joined", "neutral", "unusable"]
+__all__ = ["SMALLEST_BORDER", "THICK", "black_border", "checked_mask", "joined", "neutral", "unusable"]
 
 SMALLEST_BORDER = 64
 """Pixels of a black border, at least."""
@@ -102,39 +102,3 @@ def black_border(image: NDArray[Any]) -> NDArray[np.bool_] | None:
     is_border[borders] = True
     border: NDArray[np.bool_] = is_border[labels]
     return border
-
-
-def blank_pixels(gray: NDArray[Any], across: int, down: int) -> NDArray[np.bool_] | None:
-    """Return the pixels around which all are equal, None if there are none.
-
-    Parameters
-    ----------
-    gray : (H, W) uint8 or uint16
-    across, down : int
-        How far it is looked to either side, and up and down, pixels. Beyond the image there is nothing to differ.
-    """
-    if not _has_runs(gray, across, down):
-        return None
-    window = np.ones((2 * down + 1, 2 * across + 1), np.uint8)
-    blank = np.asarray(cv2.dilate(gray, window) == cv2.erode(gray, window))
-    return blank if blank.any() else None
-
-
-def _has_runs(gray: NDArray[Any], across: int, down: int) -> bool:
-    """Return whether there may be blank pixels: whether some row, of those of which a window holds one, has a run."""
-    rows = gray[:: down + 1]  # at the upper and lower side only half of a window lies within the image
-    width = rows.shape[1]
-    length = min(across + 1, width)
-    if length < 2:
-        return True
-    equal = rows[:, 1:] == rows[:, :-1]
-    run = equal[:, :: length - 1] if length > 2 else equal  # a run of equal neighbours holds one of these
-    return bool(run.any()) and _longest(equal) >= length - 1
-
-
-def _longest(equal: NDArray[np.bool_]) -> int:
-    """Return how many True stand side by side at most in a row."""
-    padded = np.zeros((equal.shape[0], equal.shape[1] + 2), np.int8)
-    padded[:, 1:-1] = equal
-    change = np.flatnonzero(np.diff(padded.ravel()))
-    return 0 if not change.size else int((change[1::2] - change[::2]).max())

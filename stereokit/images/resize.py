@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
-from stereokit.kernels.threads import run
+from stereokit.kernels.jit import kernel
+from stereokit.kernels.threads import run, spans
 from stereokit.kernels.workspace import Workspace
 
 __all__ = ["half_size", "reduced", "reduced_mask", "smooth"]
@@ -45,70 +46,119 @@ def smooth(
         return pair
     buffers = workspace or Workspace()
     images = pair.left, pair.right
+    height = images[0].shape[0]
+    bands = spans(height, -(-threads // 2))
     deep, blurred = ([buffers.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
+    reach = int(np.ceil(4 * sigma)) + 1  # of the kernel that OpenCV takes, at most
 
-    def blur(k: int) -> None:
-        image = images[k]
+    def blur(k: int, y0: int, y1: int) -> None:
+        """Smooth a band of rows: with more rows than it has, so that those are like in the whole."""
+        first, behind = max(y0 - reach, 0), min(y1 + reach, height)
+        image = images[k][first:behind]
         if image.dtype == np.uint8:
-            image = np.multiply(image, np.uint16(256), out=deep[k])
-        cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
+            image = np.multiply(image, np.uint16(256), out=deep[k] if len(bands) == 1 else None)
+        if len(bands) == 1:
+            cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
+            return
+        band = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+        blurred[k][y0:y1] = band.reshape(image.shape)[y0 - first : y1 - first]
 
-    run([partial(blur, 0), partial(blur, 1)], threads)
+    run([partial(blur, k, *band) for band in bands for k in (0, 1)], threads)
     left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
     return replace(pair, left=left, right=right)
 
 
-def reduced(pair: GrayPair, step: int) -> GrayPair:
+def reduced(pair: GrayPair, step: int, threads: int = 1) -> GrayPair:
     """Return the pair at 1/`step` of its size, 1, 2 or 4: halved as often as that takes."""
     while step > 1:
-        pair, step = half_size(pair), step // 2
+        pair, step = half_size(pair, threads), step // 2
     return pair
 
 
-def half_size(pair: GrayPair, *, tolerant: bool = False) -> GrayPair:
-    """Return the pair at half size, ``(ceil(H/2), ceil(W/2))``: the mean of each 2x2 pixels.
+def half_size(pair: GrayPair, threads: int = 1, *, tolerant: bool = False) -> GrayPair:
+    """Return the pair at half size, ``(ceil(H/2), ceil(W/2))``: the mean of each 2x2 pixels, halves rounded up.
 
     Odd sizes are extended by their last row or column. A pixel is bad if one of its four is.
 
     Parameters
     ----------
     pair : GrayPair
+    threads : int
+        Threads to use.
     tolerant : bool
         A pixel is bad only if all of its four are: where a fifth of the pixels are bad here and there, half of those of
         the half size would be, and nearly all of the quarter.
     """
+    shape = tuple(-(-length // 2) for length in pair.left.shape)
+    bands = spans(shape[0], threads)
+    tasks: list[Any] = []
 
     def shrink(image: NDArray[Any]) -> NDArray[Any]:
-        height, width = image.shape
-        even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-        size = (even.shape[1] // 2, even.shape[0] // 2)
-        return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA)).reshape(size[1], size[0])
+        out = np.empty(shape, image.dtype)
+        tasks.extend(partial(_halve, image, y0, y1, out) for y0, y1 in bands)
+        return out
+
+    def shrink_mask(mask: NDArray[np.bool_] | None, whole: bool = False) -> NDArray[np.bool_] | None:
+        if mask is None:
+            return None
+        out = np.empty(shape, np.bool_)
+        tasks.extend(partial(_halve_mask, np.ascontiguousarray(mask), whole, y0, y1, out) for y0, y1 in bands)
+        return out
 
     left, right = shrink(pair.left), shrink(pair.right)
     guide = left if pair.left.dtype == np.uint8 else shrink(pair.guide)
-    return replace(
+    half = replace(
         pair,
         left=left,
         right=right,
         guide=guide,
-        left_bad=_half_mask(pair.left_bad, whole=tolerant),
-        right_bad=_half_mask(pair.right_bad, whole=tolerant),
-        left_blank=_half_mask(pair.left_blank),
+        left_bad=shrink_mask(pair.left_bad, tolerant),
+        right_bad=shrink_mask(pair.right_bad, tolerant),
+        left_blank=shrink_mask(pair.left_blank),
     )
+    run(tasks, threads)
+    return half
 
 
 def reduced_mask(mask: NDArray[np.bool_] | None, step: int) -> NDArray[np.bool_] | None:
     """Return a mask at 1/`step` of its size, as `reduced` does it."""
-    while step > 1:
-        mask, step = _half_mask(mask), step // 2
+    while step > 1 and mask is not None:
+        out = np.empty(tuple(-(-length // 2) for length in mask.shape), np.bool_)
+        _halve_mask(np.ascontiguousarray(mask), False, 0, out.shape[0], out)
+        mask, step = out, step // 2
     return mask
 
 
-def _half_mask(mask: NDArray[np.bool_] | None, *, whole: bool = False) -> NDArray[np.bool_] | None:
-    """Return where one of 2x2 pixels is True or, `whole`, all are."""
-    if mask is None:
-        return None
+@kernel
+def _halve(image: NDArray[Any], y0: int, y1: int, out: NDArray[Any]) -> None:
+    """Write rows y0..y1 of the image at half size."""
+    height, width = image.shape
+    two = np.uint32(2)
+    for y in range(y0, y1):
+        upper = image[2 * y]
+        lower = image[min(2 * y + 1, height - 1)]
+        row = out[y]
+        for x in range(width // 2):
+            four = np.uint32(upper[2 * x]) + np.uint32(upper[2 * x + 1])
+            four += np.uint32(lower[2 * x]) + np.uint32(lower[2 * x + 1])
+            row[x] = (four + two) >> two
+        if width % 2 == 1:
+            row[width // 2] = (np.uint32(upper[width - 1]) + np.uint32(lower[width - 1]) + np.uint32(1)) >> np.uint32(1)
+
+
+@kernel
+def _halve_mask(mask: NDArray[np.bool_], whole: bool, y0: int, y1: int, out: NDArray[np.bool_]) -> None:
+    """Write rows y0..y1 of a mask at half size: where one of 2x2 pixels is True or, if `whole`, all are."""
     height, width = mask.shape
-    even = np.pad(mask, ((0, height % 2), (0, width % 2)), mode="edge")
-    fours = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2)
-    return np.asarray(fours.all(axis=(1, 3)) if whole else fours.any(axis=(1, 3)))
+    for y in range(y0, y1):
+        upper = mask[2 * y]
+        lower = mask[min(2 * y + 1, height - 1)]
+        row = out[y]
+        for x in range(width // 2):
+            if whole:
+                row[x] = upper[2 * x] & upper[2 * x + 1] & lower[2 * x] & lower[2 * x + 1]
+            else:
+                row[x] = upper[2 * x] | upper[2 * x + 1] | lower[2 * x] | lower[2 * x + 1]
+        if width % 2 == 1:
+            above, below = upper[width - 1], lower[width - 1]
+            row[width // 2] = above & below if whole else above | below

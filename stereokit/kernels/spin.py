@@ -1,9 +1,13 @@
-"""Wait for another thread for a moment, without help from the interpreter.
+"""Wait for another thread for a moment, and share out work, without help from the interpreter.
 
 A stage at half size lasts a few hundred microseconds; to hand its tasks out and to wait for them through the
 interpreter's queues and locks takes 50 to 80. Who looks at a word in memory instead sees its change within a
 microsecond. That uses a processor, so it must not last: after a few microseconds the processor is offered to others
-between two looks, and after a few milliseconds the call returns.
+between two looks, and after a few milliseconds `spin_while` returns, and `wait_until` sleeps between two looks.
+
+`claim`, `publish` and `wait_until` let kernels that run side by side work on rows of which each needs the one before.
+Who claims a row works on it until it is done, and waits for rows alone that were claimed earlier: so some thread
+always gets on, however few there are.
 """
 
 from __future__ import annotations
@@ -19,12 +23,18 @@ from numpy.typing import NDArray
 
 from stereokit.kernels.jit import kernel
 
-__all__ = ["spin_while"]
+__all__ = ["WORDS_APART", "claim", "publish", "spin_while", "wait_until"]
+
+WORDS_APART = 8
+"""Elements of int64 from one word to the next that another thread writes: they share no cache line."""
 
 _BUSY_LOOKS = 256
 """Looks, each some tens of nanoseconds, before the processor is offered to others between looks."""
 _LOOKS = 8_000
 """Looks in all: a few milliseconds where nobody else wants the processor."""
+_LOOKS_AWAKE = 1_000
+"""Looks of `wait_until` before it sleeps between two: some hundred microseconds."""
+_SLEEP_MICROSECONDS = 50
 
 
 @intrinsic
@@ -65,3 +75,52 @@ def spin_while(words: NDArray[Any], index: int, value: int) -> bool:
             return True
         _pause(looks)
     return False
+
+
+@intrinsic
+def claim(typing: Any, words: Any, index: Any) -> Any:
+    """Return an element and raise it by 1: no two threads get the same number."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", builder.gep(data, [args[1]]), ir.Constant(ir.IntType(64), 1), "seq_cst")
+
+    return types.int64(words, types.intp), generate
+
+
+@intrinsic
+def publish(typing: Any, words: Any, index: Any, value: Any) -> Any:
+    """Set an element; who sees its new value sees all that this thread wrote before."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        builder.store_atomic(args[2], builder.gep(data, [args[1]]), "seq_cst", 8)
+        return context.get_dummy_value()
+
+    return types.void(words, types.intp, types.int64), generate
+
+
+@intrinsic
+def _sleep(typing: Any, microseconds: Any) -> Any:
+    """Leave the processor to others for a while; on Windows, where it is left to the system, at once."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if os.name == "posix":
+            kind = ir.FunctionType(ir.IntType(32), [ir.IntType(32)])
+            sleep = cgutils.get_or_insert_function(builder.module, kind, "usleep")
+            builder.call(sleep, [builder.trunc(args[0], ir.IntType(32))])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), generate
+
+
+@kernel
+def wait_until(words: NDArray[Any], index: int, value: int) -> None:
+    """Wait until element `index` of the int64 `words` is at least `value`."""
+    looks = 0
+    while _look(words, index) < value:
+        if looks < _LOOKS_AWAKE:
+            _pause(looks)
+        else:
+            _sleep(_SLEEP_MICROSECONDS)
+        looks += 1

@@ -30,6 +30,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from stereokit.kernels.spin import spin_while
+from stereokit.kernels.trace import runner
 
 __all__ = ["Job", "Team", "Workers", "available_threads", "run", "run_stages", "spans", "team"]
 
@@ -291,6 +292,11 @@ def run(tasks: Sequence[Task], threads: int) -> None:
 def run_stages(stages: Sequence[Sequence[Task]], threads: int) -> None:
     """Run the tasks of each stage, at most `threads` at a time, when all of the stage before have ended."""
     stages = [stage for stage in stages if len(stage) > 0]
+    own = runner()
+    if own is not None:
+        for stage in stages:
+            own.side_by_side(stage)
+        return
     if min(threads, max(map(len, stages), default=0)) < 2:
         for stage in stages:
             for task in stage:

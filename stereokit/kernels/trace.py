@@ -2,16 +2,18 @@
 
 Nobody listens by default, and a span costs next to nothing. `observed` hands the spans of the code in its ``with``
 block to an observer; what other threads do at the same time is not seen, since a context variable carries it.
+
+`tasks_by` hands the tasks themselves, which threads would share, to one who runs them in turn and takes their times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Protocol
 
-__all__ = ["GROUPS", "Observer", "observed", "span"]
+__all__ = ["GROUPS", "Observer", "Runner", "observed", "runner", "span", "tasks_by"]
 
 GROUPS = ("prepare", "match", "clean", "refine")
 """Groups of stages in their order: checks, resizing and what a cost prepares; the sweep, which makes costs, adds them
@@ -65,3 +67,34 @@ def observed(observer: Observer) -> Iterator[None]:
         yield
     finally:
         _observer.reset(token)
+
+
+class Runner(Protocol):
+    """Runs tasks that threads would share, on the calling thread."""
+
+    def side_by_side(self, tasks: Sequence[Callable[[], object]]) -> None:
+        """Run tasks of which none needs another."""
+
+    def in_line(self, lines: Sequence[Iterable[Callable[[], object]]], blocks: int, shared: bool) -> None:
+        """Run lines of tasks: each task needs the one before in its line, block by block, and no other line.
+
+        Threads may share a line where that is `shared`; else each line is one thread's.
+        """
+
+
+_runner: ContextVar[Runner | None] = ContextVar("stereokit.tasks", default=None)
+
+
+def runner() -> Runner | None:
+    """Return who runs the tasks of this thread instead of its team."""
+    return _runner.get()
+
+
+@contextmanager
+def tasks_by(runner: Runner) -> Iterator[None]:
+    """Hand the tasks of a ``with`` block, of this thread, to a runner."""
+    token = _runner.set(runner)
+    try:
+        yield
+    finally:
+        _runner.reset(token)

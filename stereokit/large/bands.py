@@ -97,7 +97,7 @@ class BandAssembler:
         window = row.start, row.stop, column.start, column.stop
         pair = read_pair(*self._sources, self._mapping, window, self._ranges)
         self.views_equal = self.views_equal and same_pixels(pair.left, pair.right)
-        pair = with_blank(pair, self._window_matcher.settings)
+        pair = with_blank(pair, self._window_matcher.settings, self._window_matcher.threads)
         result = self._window_matcher.match_gray(pair, self._window_matcher.threads, keeps_blank=True)
         columns = slice(column.first - column.start, column.last - column.start)
         rows = slice(top - row.start, top - row.start + len(band))

@@ -17,7 +17,7 @@ from stereokit.images.check import MAX_DISPARITY, check_flag, check_integer
 from stereokit.images.maps import numbers
 from stereokit.kernels import simd
 from stereokit.kernels.jit import inline, kernel
-from stereokit.kernels.simd import LANES, first_bit, load, lowest, mask_equal, minimum, splat
+from stereokit.kernels.simd import LANES, first_bit, load, lowest, mask_equal, minimum, splat, without_three
 
 __all__ = ["SelectionOutput", "margin_of", "parabola", "select", "select_row", "selection_output"]
 
@@ -102,20 +102,16 @@ def select_pixel(
 @inline
 def _rival(keys: NDArray[Any], at: int, blocks: tuple[int, ...], level: int, levels: int) -> Any:
     """Return the level of the lowest cost that is not next to the winner, the lowest of equals; `level` if none is."""
-    first = max(level - 1, 0)
-    behind_last = min(level + 2, levels)
-    first_key = keys[at + first]
-    level_key = keys[at + level]
-    last_key = keys[at + behind_last - 1]
-    most = np.iinfo(keys.dtype).max
-    keys[at + first] = most
-    keys[at + level] = most
-    keys[at + behind_last - 1] = most
-    _, other = _best_level(keys, at, blocks)
-    keys[at + level] = level_key
-    keys[at + first] = first_key
-    keys[at + behind_last - 1] = last_key
-    if other >= levels or (other >= first and other < behind_last):
+    smallest = without_three(load(keys, at), level - 1)
+    for n in range(1, len(blocks)):
+        smallest = minimum(smallest, without_three(load(keys, at + n * LANES), level - 1 - n * LANES))
+    lowest_key = splat(lowest(smallest))
+    other = np.int64(level)
+    for back in range(len(blocks)):
+        block = (len(blocks) - 1 - back) * LANES
+        first = first_bit(mask_equal(without_three(load(keys, at + block), level - 1 - block), lowest_key))
+        other = simd.select(first < 64, block + first, other)
+    if other >= levels or abs(other - level) < 2:
         return level
     return other
 

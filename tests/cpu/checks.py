@@ -64,7 +64,7 @@ def zncc_volume(shape, minimum, count, window, seed=1):
 
 
 def check_zncc(shape=(8, 9), minimum=-2, count=6, window=5, steps=31, order=(0, 1, 2, 3, 7, 6, 5, 4, 5)):
-    """Compare all cells of rows that are asked for downwards, upwards and out of turn."""
+    """Compare all cells of rows that are asked for downwards, upwards and out of turn, and of parts of rows."""
     from stereokit import Zncc
     from stereokit.costs.rows import CostInput, Levels, cost_row
     from stereokit.kernels.workspace import Workspace
@@ -74,10 +74,16 @@ def check_zncc(shape=(8, 9), minimum=-2, count=6, window=5, steps=31, order=(0, 
     (rows,) = Zncc(window, steps).prepare(CostInput(left, right, None, None, levels, 1.0), Workspace(), 1)
     for y in order:
         out = np.full(shape[1] * levels.padded, 77, np.uint8)
-        cost_row(rows, y, out)
+        cost_row(rows, y, 0, shape[1], out)
         row = out.reshape(shape[1], levels.padded)
         assert np.abs(row[:, :count] - expected[y] * steps).max() <= 0.5 + 1e-4 * steps
         assert (row[:, count:] == 255).all()
+    for y, x0, x1 in ((3, 0, 4), (4, 0, 4), (5, 0, 6), (6, 5, 9), (5, 5, 9), (5, 2, 3)):
+        out = np.full(shape[1] * levels.padded, 77, np.uint8)
+        cost_row(rows, y, x0, x1, out)
+        row = out.reshape(shape[1], levels.padded)
+        assert np.abs(row[x0:x1, :count] - expected[y, x0:x1] * steps).max() <= 0.5 + 1e-4 * steps
+        assert (row[:x0] == 77).all() and (row[x1:] == 77).all()
 
 
 def check_zncc_of_many_steps():
@@ -128,6 +134,7 @@ def check_paths(
     edge_factor=1.0,
     recovers=False,
     guide=None,
+    threads=1,
 ):
     """Compare sums over the paths, exactly."""
     from stereokit import RowCost, aggregate
@@ -137,7 +144,7 @@ def check_paths(
 
     volume, own, expected = path_sums(shape, count, p1, p2, paths, pattern, largest, edge_factor)
     guide = own if guide is None else guide
-    options = {"p1": p1, "p2": p2, "paths": paths, "edge": 8, "edge_factor": edge_factor, "threads": 1}
+    options = {"p1": p1, "p2": p2, "paths": paths, "edge": 8, "edge_factor": edge_factor, "threads": threads}
     total = aggregate(volume, guide, "sgm", cost=Cost(lambda *_: None, largest), **options)
     np.testing.assert_array_equal(total, expected)
 
@@ -174,6 +181,12 @@ def check_recovered():
     for count in (5, 70, 130):
         for largest, p2 in ((62, 60), (31, 224), (254, 1)):
             check_paths((5, 4), count, p2 // 3, p2, 4, largest=largest, recovers=True, edge_factor=0.5)
+
+
+def check_shared():
+    """Compare what three threads make together, of bands of columns and then of pairs of rows."""
+    for recovers in (False, True):
+        check_paths((14, 100), 5, paths=4, edge_factor=0.5, recovers=recovers, threads=3)
 
 
 def check_bytes():
@@ -326,11 +339,13 @@ def check_narrow_zncc(shape=(5, 12), window=5):
     starts = np.random.default_rng(3).choice([0, 8, 36], (shape[0], shape[1] // 3)).repeat(3, axis=1).astype(np.int16)
     pair = CostInput(left, right, None, None, Levels(-2, 100), 1.0, 1, None, starts)
     (rows,) = Zncc(window, 31).prepare(pair, Workspace(), 1)
-    for y in (0, 3, 2):
+    for y, x0, x1 in ((0, 0, 12), (3, 0, 12), (2, 0, 12), (2, 0, 5), (2, 4, 12)):
         out = np.full(shape[1] * 64, 77, np.uint8)
-        cost_row(rows, y, out)
+        cost_row(rows, y, x0, x1, out)
         wanted = np.array([expected[y, x, s:][:64] for x, s in enumerate(starts[y])]) * 31
-        assert np.abs(out.reshape(wanted.shape) - wanted).max() <= 0.5 + 1e-4 * 31
+        row = out.reshape(wanted.shape)
+        assert np.abs(row - wanted)[x0:x1].max() <= 0.5 + 1e-4 * 31
+        assert (row[:x0] == 77).all() and (row[x1:] == 77).all()
 
 
 def check_smp():

@@ -11,6 +11,7 @@ import importlib.abc
 import importlib.machinery
 import importlib.util
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -53,10 +54,28 @@ def _spin_while(words: Any, index: int, value: int) -> bool:
     return False
 
 
+_one_claim = threading.Lock()
+
+
+def _claim(words: Any, index: int) -> int:
+    with _one_claim:
+        words[index] += 1
+        return int(words[index]) - 1
+
+
+def _publish(words: Any, index: int, value: int) -> None:
+    words[index] = value
+
+
+def _wait_until(words: Any, index: int, value: int) -> None:
+    while words[index] < value:
+        time.sleep(0)
+
+
 def _stand_ins() -> dict[str, ModuleType]:
     jit, spin = ModuleType("stereokit.kernels.jit"), ModuleType("stereokit.kernels.spin")
     vars(jit).update(CHECKED=True, FINGERPRINT="", kernel=_same, inline=_same, by_types=_by_types)
-    vars(spin).update(spin_while=_spin_while)
+    vars(spin).update(WORDS_APART=1, claim=_claim, publish=_publish, spin_while=_spin_while, wait_until=_wait_until)
     return {jit.__name__: jit, spin.__name__: spin, "stereokit.kernels.simd": lanes}
 
 

@@ -189,5 +189,11 @@ def first_bit(mask: int) -> int:
     return (mask & -mask).bit_length() - 1 if mask else LANES
 
 
+def without_three(value: Lanes, first: int) -> Lanes:
+    values = value.values.copy()
+    values[max(first, 0) : max(first + 3, 0)] = np.iinfo(values.dtype).max
+    return Lanes(values)
+
+
 def select(condition: Any, a: Any, b: Any) -> Any:
     return a if condition else b

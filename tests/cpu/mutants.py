@@ -107,12 +107,26 @@ MUTANTS = [
     ),
     Mutant(
         "an odd last row brings a row behind it", "aggregation.sgm",
-        "min(2, visits - k)", "2", _BOUNDS, "paths",
+        "min(2, visits - k)", "2", _BOUNDS, "paths", "_last_visit",
     ),
     Mutant(
         "the second half's diagonals start where the first half's did", "aggregation.sgm",
-        "finish_part(buffers, half, y, k0 + k, x0, x1, sums, both)",
-        "finish_part(buffers, half, y, k, x0, x1, sums, both)", _RULE, "paths",
+        "finish_part(buffers, half, y, k0 + k + half, x0, x1, sums, both)",
+        "finish_part(buffers, half, y, k + half, x0, x1, sums, both)", _RULE, "paths",
+    ),
+    Mutant(
+        "the second row of a pair counts as the first", "aggregation.sgm",
+        "finish_part(buffers, half, y, k0 + k + half, x0, x1, sums, both)",
+        "finish_part(buffers, half, y, k0 + k, x0, x1, sums, both)", _RULE, "paths",
+    ),
+    Mutant(
+        "every worker visits all rows", "aggregation.sgm",
+        "last(sweep, k, parts[sweep], words[sweep])", "last(sweep, k, parts[sweep], words[sweep].copy())", _RULE,
+        "shared",
+    ),
+    Mutant(
+        "a band of columns begins a column too late", "aggregation.paths.visits",
+        "range(x0, x1)", "range(x0 + min(x0, 1), x1)", _RULE, "shared", "_leave_row",
     ),
     Mutant(
         "four costs and a bracket in a byte that holds three", "aggregation.sgm",
@@ -142,7 +156,12 @@ MUTANTS = [
     ),
     Mutant(
         "the row that goes is added", "costs.zncc",
-        "_write_pairs(rows, 0, row_in, row_out, n, -n)", "_write_pairs(rows, 0, row_in, row_out, n, n)", _RULE, "zncc",
+        "_write_pairs(rows, x0, x1, 0, row_in, row_out, n, -n)", "_write_pairs(rows, x0, x1, 0, row_in, row_out, n, n)",
+        _RULE, "zncc",
+    ),
+    Mutant(
+        "column sums of another part are taken over", "costs.zncc",
+        "state[1] == x0 and state[2] == x1", "True", _RULE, "zncc",
     ),
     Mutant(
         "the row that goes is one too low on the way up", "costs.zncc",
@@ -183,7 +202,11 @@ MUTANTS = [
     # ------------------------------------------------------------------ selection
     Mutant(
         "of equal costs the highest block wins", "selection.wta",
-        "block = (len(blocks) - 1 - back) * LANES", "block = back * LANES", _RULE, "selection",
+        "block = (len(blocks) - 1 - back) * LANES", "block = back * LANES", _RULE, "selection", "_best_level",
+    ),
+    Mutant(
+        "of equal rivals the one in the highest block wins", "selection.wta",
+        "block = (len(blocks) - 1 - back) * LANES", "block = back * LANES", _RULE, "selection", "_rival",
     ),
     Mutant(
         "the last level is interpolated with a pad", "selection.wta",
@@ -191,16 +214,11 @@ MUTANTS = [
     ),
     Mutant(
         "a neighbour of the winner counts as its rival", "selection.wta",
-        "min(level + 2, levels)", "min(level + 1, levels)", _RULE, "selection",
+        "without_three(load(keys, at), level - 1)", "without_three(load(keys, at), level - 2)", _RULE, "selection",
     ),
     Mutant(
         "the second candidate replaces the first", "selection.wta",
         "out.candidates[out.candidates.size // 2 + to]", "out.candidates[to]", _RULE, "selection",
-    ),
-    Mutant(
-        "the search for a rival leaves its marks", "selection.wta",
-        "keys[at + level] = level_key\nkeys[at + first] = first_key\nkeys[at + last - 1] = last_key",
-        "keys[at + level] = level_key", _RULE, "selection",
     ),
     # ------------------------------------------------------------------ domain transform
     Mutant(

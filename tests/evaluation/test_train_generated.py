@@ -13,6 +13,7 @@ pytest.importorskip("skimage")
 import numpy as np  # noqa: E402
 
 from stereokit.cli.app import app  # noqa: E402
+from stereokit.io import write_image  # noqa: E402
 from stereokit_evaluation.synthetic import generated as synthetic  # noqa: E402
 from stereokit_evaluation.training import general  # noqa: E402
 from stereokit_evaluation.training import generated as training  # noqa: E402
@@ -38,9 +39,9 @@ def rendered(monkeypatch):
     """Make pairs small; return the seeds that were rendered."""
     real, seeds = synthetic.generate_pair, []
 
-    def generate_pair(seed, kind=None):
+    def generate_pair(seed, kind=None, assets=None):
         seeds.append(seed)
-        return real(seed, "flying", size=(192, 96))
+        return real(seed, "flying", size=(192, 96), assets=assets)
 
     monkeypatch.setattr(synthetic, "generate_pair", generate_pair)
     return seeds
@@ -99,6 +100,39 @@ def test_other_pairs_of_the_cache_are_left_out(tmp_path, rendered):
     assert general._exactly(folder, 3, tmp_path)[0] != exact
 
 
+@pytest.fixture
+def assets(tmp_path):
+    """Return a folder with a photograph and its licence."""
+    folder = tmp_path / "assets"
+    folder.mkdir()
+    noise = np.random.default_rng(0).integers(0, 256, (150, 150), dtype=np.uint8)
+    write_image(folder / "wall.png", noise)
+    (folder / "manifest.json").write_text('{"files": [{"file": "wall.png", "licence": "CC0"}]}')
+    return folder
+
+
+@pytest.mark.parametrize("refiner", ["cnn", "stereokit"])
+def test_assets_are_shown_and_noted(tmp_path, assets, rendered, monkeypatch, refiner):
+    monkeypatch.setattr(torch, "compile", lambda function: function)
+    monkeypatch.setattr(general, "_SAMPLES", 1)
+    out, cache = tmp_path / "out", tmp_path / "cache"
+    words = ["--refiner", refiner, "--generated", 2, "--cache", cache, *SMALL, "--json"]
+    assert run("-o", tmp_path / "plain", *words, "-").exit_code == 0
+    (assets / "broken.jpg").write_text("text")
+    done = run("-o", out, *words, tmp_path / "report.json", "--assets", assets)
+    assert done.exit_code == 0, done.output
+    assert done.stderr.count("warning: assets: left out:") == 1 and "broken.jpg" in done.stderr
+    assert rendered == [FIRST_SEED, FIRST_SEED + 1] * 2  # those without assets are other pairs
+    notes = read(out / "weights.safetensors").notes["assets"]
+    assert (notes["photographs"], notes["models"], notes["licences"]) == (1, 0, {"CC0": 1})
+    assert json.loads((tmp_path / "report.json").read_text())["assets"] == notes
+    assert "assets" not in read(tmp_path / "plain" / "weights.safetensors").notes
+    assert len(list((cache / "pairs").glob(f"*-{notes['digest']}.npz"))) == 2
+    if refiner == "stereokit":
+        exact = [{path.name for path in folder.iterdir()} for folder in cache.glob("pairs-*")]
+        assert len(exact) == 2 and not exact[0] & exact[1]
+
+
 @pytest.mark.parametrize(("farthest", "levels"), [(0, 32), (24, 32), (24.5, 64), (120, 128), (121, 160)])
 def test_levels_hold_the_largest_disparity(farthest, levels):
     truth = np.full((4, 6), np.nan, np.float32)
@@ -116,6 +150,9 @@ def test_levels_hold_the_largest_disparity(farthest, levels):
         (["--refiner", "stereokit", "--generated", 2, "--set", "loss=l1"], ["one of general, d1", "got 'l1'"]),
         (["--refiner", "stereokit", "--generated", 2, "--set", "rows=40"], ["rows must be a multiple of 32", "40"]),
         (["--refiner", "stereokit", "--generated", 2, "--set", "steps=0"], ["steps must be at least 1", "0"]),
+        (["--refiner", "cnn", "--streets", 2, "--assets", "."], ["assets must come with generated pairs", "'.'"]),
+        (["--refiner", "cnn", "--generated", 2, "--assets", "none"], ["assets must be a folder", "none"]),
+        (["--refiner", "stereokit", "--generated", 2, "--assets", "none"], ["assets must be a folder", "none"]),
         (["--refiner", "cnn", "--generated", -1], ["generated must be at least 0", "-1"]),
         (["--refiner", "cnn"], ["dataset, extra, streets or generated"]),
     ],

@@ -12,7 +12,8 @@ import pytest
 import stereokit
 from stereokit import Matcher
 from stereokit.errors import InputError
-from stereokit.images.evidence import black_border, blank_pixels
+from stereokit.images.blank import blank_pixels
+from stereokit.images.evidence import black_border
 from stereokit.io import read_image, read_pair, write_image
 from stereokit.large.border import find_border
 from stereokit.large.sources import open_source
@@ -275,7 +276,7 @@ def test_blank_pixels_are_those_with_equal_surroundings(kind):
             y, x = rng.integers(0, height), rng.integers(0, width)
             gray[y : y + rng.integers(1, 16), x : x + rng.integers(1, 16)] = rng.integers(0, 2)
         across, down = (int(side) for side in rng.integers(0, 6, 2))
-        result = blank_pixels(gray, across, down)
+        result = blank_pixels(gray, across, down, int(rng.integers(1, 9)))
         expected = plain_blank(gray, across, down)
         np.testing.assert_array_equal(np.zeros(gray.shape, bool) if result is None else result, expected)
 

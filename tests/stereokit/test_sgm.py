@@ -133,6 +133,15 @@ def test_census_penalties_are_neighbours_that_differ():
 
 
 @pytest.mark.parametrize("paths", [4, 5, 8])
+def test_rows_of_more_columns_than_are_summed_at_a_time(paths):
+    volume, guide = volume_of((6, 150), 6, 62, seed=12), guide_of((6, 150), 12)
+    expected = oracles.sgm(volume, 7, 60, oracles.DIRECTIONS[paths], guide, 8, 0.5)
+    for threads in (1, 4):
+        options = {"p1": 7, "p2": 60, "edge": 8, "edge_factor": 0.5, "paths": paths, "threads": threads}
+        np.testing.assert_array_equal(aggregate(volume, guide, "sgm", cost=cost_of(62), **options), expected)
+
+
+@pytest.mark.parametrize("paths", [4, 5, 8])
 def test_sums_do_not_depend_on_threads(paths):
     volume = volume_of((9, 7), 20, 62, seed=7)
     one = sums(volume, 62, 7, 100, paths, threads=1)

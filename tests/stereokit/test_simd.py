@@ -215,6 +215,20 @@ def test_comparisons_of_lanes(run, dtype):
 
 
 @kernel
+def _without_three(a, first, out):
+    simd.store(out, 0, simd.without_three(simd.load(a, 0), first))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.int32])
+@pytest.mark.parametrize("first", [-32768, -3, -2, -1, 0, 17, 61, 62, 63, 64, 32767])
+def test_three_lanes_are_left_out(run, dtype, first):
+    a, out = integers(dtype, 0), np.empty(COUNT, dtype)
+    run(_without_three, a, first, out)
+    expected = [np.iinfo(dtype).max if first <= k < first + 3 else a[k] for k in range(COUNT)]
+    np.testing.assert_array_equal(out, expected)
+
+
+@kernel
 def _converted(values, out):
     simd.store(out, 0, simd.convert(simd.load(values, 0), out[0]))
 

@@ -11,6 +11,7 @@ OpenCV's SGBM and HH modes hardly use a second thread; they are reported for eve
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Annotated
@@ -31,6 +32,7 @@ from stereokit.methods import parse_method
 from stereokit_evaluation.bench import gpu as gpu_times
 from stereokit_evaluation.bench.baselines import BASELINES, Call, baselines, label, make, opencv_threads
 from stereokit_evaluation.bench.probes import ProbeError, first_call, image_files, memory_added
+from stereokit_evaluation.bench.simulation import Simulated, print_simulated, simulate
 from stereokit_evaluation.bench.stages import allocated_bytes, stage_times
 from stereokit_evaluation.bench.table import BenchResult, as_json, machine, print_tables, system_load, versions
 from stereokit_evaluation.bench.timing import round_robin
@@ -80,6 +82,10 @@ def bench(
     ] = False,
     scale: Annotated[float, typer.Option(help="With cuda or --model: match at this size, 1 or 0.5.")] = 1.0,
     stages: Annotated[bool, typer.Option("--stages", help="Time the stages of our methods too.")] = False,
+    simulate_cores: Annotated[
+        str | None,
+        typer.Option("--simulate", help="Instead: times on so many cores, such as 4,8,16, simulated from tasks."),
+    ] = None,
     left: Annotated[Path | None, typer.Option(help="Left image, instead of a synthetic one.")] = None,
     right: Annotated[Path | None, typer.Option(help="Right image.")] = None,
     memory: Annotated[
@@ -103,7 +109,8 @@ def bench(
     if rounds < 1:
         raise OptionError(f"rounds must be at least 1, got {rounds}")
     check_json(json_file)
-    _check_tables(model, device, pipeline, stages, scale, runtimes, weights)
+    cores = [] if simulate_cores is None else parse_threads(simulate_cores, "simulate")
+    _check_tables(model, device, pipeline, stages, bool(cores), scale, runtimes, weights)
     if (left is None) != (right is None):
         raise OptionError("left and right go together, got only one of them")
     pictures = None if left is None or right is None else (_read(left), _read(right))
@@ -118,6 +125,8 @@ def bench(
         if pictures is not None:
             raise OptionError(f"left must not come with model, which looks at no image, got {str(left)!r}")
         return gpu_report.model(problem_sizes, methods, scale, json_file)
+    if cores:
+        return _simulate(problem_sizes, methods, cores, rounds, pictures, json_file)
     build = None
     if device == "cuda":
         builders, counts = gpu_times.contenders(methods, scale), [max(counts)]  # only the baselines have threads
@@ -163,12 +172,14 @@ def bench(
 
 
 def _check_tables(
-    model: bool, device: str, pipeline: bool, stages: bool, scale: float, runtimes: str | None, weights: str | None
-) -> None:
+    model: bool, device: str, pipeline: bool, stages: bool, simulated: bool, scale: float, runtimes: str | None,
+    weights: str | None,
+) -> None:  # fmt: skip
     """Refuse options that do not go together."""
     if device not in ("cpu", "cuda"):
         raise OptionError(f"device must be 'cpu' or 'cuda', got {device!r}")
     requests = {"model": model, "device cuda": device == "cuda", "pipeline": pipeline, "stages": stages}
+    requests["simulate"] = simulated
     tables = [name for name, is_set in requests.items() if is_set]
     if len(tables) > 1:
         raise OptionError(f"{tables[0]} and {tables[1]} are two tables, got both; choose one")
@@ -228,6 +239,29 @@ def _pipeline(
         print_pipeline(sizes, rows)
     if interrupted:
         raise typer.Exit(130)
+
+
+def _simulate(
+    sizes: Sequence[Size], methods: Sequence[str], cores: Sequence[int], rounds: int,
+    pictures: tuple[Gray, Gray] | None, json_file: Path | None,
+) -> None:  # fmt: skip
+    """Simulate matches on more cores; print the table, or write it."""
+    simulated: dict[tuple[str, str], list[Simulated]] = {}
+    machine_info = machine(system_load())
+    with progress(len(sizes) * len(methods)) as (_, step):
+        for size in sizes:
+            images = _images(size, pictures)
+            for name in methods:
+                with opencv_threads(1):
+                    simulated[size.name, label(name)] = simulate(name, size.levels, *images, cores, rounds)
+                step(f"{size.name}: {label(name)}")
+    rows = [
+        {"size": size, "method": name, **asdict(row), "speed_up": row.speed_up, "serial_share": row.serial_share}
+        for (size, name), found in simulated.items()
+        for row in found
+    ]
+    if not write_json(json_file, {"simulated": rows, "machine": machine_info, "versions": versions()}):
+        print_simulated(simulated)
 
 
 def _read(path: Path) -> Gray:

@@ -37,6 +37,9 @@ def train(
     extra_share: Annotated[float, typer.Option(help="Share of the crops that are of extra frames.")] = 0.2,
     streets: Annotated[int, typer.Option(help="Synthetic streets to train on.")] = 0,
     generated: Annotated[int, typer.Option(help="Generated pairs of all kinds to train on.")] = 0,
+    assets: Annotated[
+        Path | None, typer.Option(help="Folder of photographs and models that generated pairs may show.")
+    ] = None,
     street_share: Annotated[float, typer.Option(help="Share of the crops of streets and generated pairs.")] = 0.5,
     method: Annotated[list[str] | None, typer.Option(help="Matchers; may repeat. Default S1 to S4.")] = None,
     variants: Annotated[int, typer.Option(help="Variants of each frame and matcher.")] = 9,
@@ -54,7 +57,7 @@ def train(
         output, refiner, dataset=dataset, root=root, frames=frames, validation=validation, folds=folds,
         extra=extra or (), extra_share=extra_share, streets=streets, generated=generated,
         street_share=street_share, variants=variants, start=start, preset=preset, settings=settings or (),
-        max_disparity=max_disparity, cache=cache, **matchers,
+        max_disparity=max_disparity, cache=cache, assets=assets, **matchers,
     )  # fmt: skip
     if document.pop("rank") == 0 and not write_json(json_file, document):
         _print(document)

@@ -57,8 +57,8 @@ def parse_sizes(text: str) -> list[Size]:
     return list(dict.fromkeys(sizes))
 
 
-def parse_threads(text: str) -> list[int]:
-    """Return the numbers in `text`, such as ``"1,2"``, each once.
+def parse_threads(text: str, name: str = "threads") -> list[int]:
+    """Return the numbers in `text`, such as ``"1,2"``, each once; `name` is what messages call it.
 
     Raises
     ------
@@ -67,5 +67,5 @@ def parse_threads(text: str) -> list[int]:
     """
     words = [word.strip() for word in text.split(",")]
     if not all(re.fullmatch(r"[0-9]{1,4}", word) and 1 <= int(word) <= 1024 for word in words):
-        raise OptionError(f"threads must be whole numbers from 1 to 1024, with commas, got {text!r}")
+        raise OptionError(f"{name} must be whole numbers from 1 to 1024, with commas, got {text!r}")
     return list(dict.fromkeys(int(word) for word in words))

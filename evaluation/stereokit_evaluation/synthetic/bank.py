@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereokit_evaluation.synthetic.patterns import PATTERNS, SIZE
 from stereokit_evaluation.synthetic.textures import photograph
 
-__all__ = ["KINDS", "LEVELS", "PHOTOGRAPHS", "SIZE", "STARTS", "TOTAL", "pyramid", "texture"]
+__all__ = ["KINDS", "LEVELS", "PHOTOGRAPHS", "SIZE", "STARTS", "TOTAL", "cropped", "halvings", "pyramid", "texture"]
 
 Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -55,7 +55,15 @@ def _levelled(field: Float, deviation: float = 45.0) -> Bytes:
 
 def _photograph(rng: Rng) -> Float:
     """Return a part of a photograph, mirrored or turned."""
-    image: Any = photograph(list(PHOTOGRAPHS)[int(rng.integers(len(PHOTOGRAPHS)))])
+    return _part(photograph(list(PHOTOGRAPHS)[int(rng.integers(len(PHOTOGRAPHS)))]), rng)
+
+
+def cropped(image: Bytes, rng: Rng) -> Bytes:
+    """Return a part of a picture, (H, W) or (H, W, 3), as a texture."""
+    return _levelled(_part(image, rng))
+
+
+def _part(image: Any, rng: Rng) -> Float:
     if image.ndim == 3:
         weights = rng.uniform(0.2, 1, 3)
         image = image[..., :3] @ (weights / weights.sum())
@@ -82,7 +90,12 @@ def texture(kind: str, number: int) -> Bytes:
 @lru_cache(maxsize=400)
 def pyramid(kind: str, number: int) -> Bytes:
     """Return a texture and its halvings as one flat array of `TOTAL` uint8; read-only."""
-    level: Any = texture(kind, number).astype(np.uint32)
+    return halvings(texture(kind, number))
+
+
+def halvings(image: Bytes) -> Bytes:
+    """Return the pyramid of a texture (512, 512) as `pyramid` does."""
+    level: Any = image.astype(np.uint32)
     parts = []
     for _ in range(LEVELS):
         parts.append(level.astype(np.uint8).ravel())

@@ -7,7 +7,7 @@ import numpy as np
 from stereokit_evaluation.synthetic.meshes import blob, grid, heightfield, lathe, rotation, tube
 from stereokit_evaluation.synthetic.stage import Stage
 from stereokit_evaluation.synthetic.terrain import relief
-from stereokit_evaluation.synthetic.things import bumps
+from stereokit_evaluation.synthetic.things import bumps, has_models, model
 
 __all__ = ["closeup"]
 
@@ -91,6 +91,11 @@ def closeup(stage: Stage) -> None:
         if rng.random() < 0.5:
             cap = lathe(np.array([1e-6, radius * 1.2, radius * 1.2, 1e-6]), np.array([-0.3, -0.3, 0.3, 0.3]), 24)
             stage.add(cap, metal, None, rotation(0, 0, float(rng.uniform(0, 3))), tip)
+    if has_models(stage):
+        for _ in range(int(rng.choice([0, 1, 3], p=[0.5, 0.25, 0.25]))):
+            z = float(rng.uniform(6, 10))
+            spot = np.array([rng.uniform(-0.8, 0.8) * half * z / 10, rng.uniform(-0.6, 0.6) * half * z / 10, z])
+            model(stage, float(rng.uniform(0.15, 0.7)) * half, spot, rotation(*rng.uniform(-3, 3, 3)))
     for _ in range(int(rng.choice([0, 1, 4], p=[0.7, 0.2, 0.1]))):  # threads
         a, b = (np.array([rng.uniform(-1, 1) * half, rng.uniform(-1, 1) * half, rng.uniform(7, 9)]) for _ in range(2))
         t = np.linspace(0, 1, 20)[:, None]

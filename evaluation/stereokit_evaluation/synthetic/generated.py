@@ -18,6 +18,7 @@ from stereokit.errors import OptionError
 from stereokit.io import write_bytes
 from stereokit_evaluation.common.fingerprint import fingerprint
 from stereokit_evaluation.common.folders import make_folder
+from stereokit_evaluation.synthetic.assets import Assets
 from stereokit_evaluation.synthetic.closeups import closeup
 from stereokit_evaluation.synthetic.objects import flying, pile
 from stereokit_evaluation.synthetic.outdoor import garden, road
@@ -28,7 +29,7 @@ from stereokit_evaluation.synthetic.sensors import Sensor, draw_sensors, expose
 from stereokit_evaluation.synthetic.stage import Stage
 from stereokit_evaluation.synthetic.terrain import terrain
 
-__all__ = ["KINDS", "GeneratedPair", "generate_pair", "kind_of", "pairs"]
+__all__ = ["KINDS", "GeneratedPair", "generate_pair", "kind_of", "pair_name", "pairs"]
 
 Rng = np.random.Generator
 
@@ -108,7 +109,9 @@ def kind_of(seed: int) -> str:
     return _MIX[_checked("seed", seed) % len(_MIX)]
 
 
-def generate_pair(seed: int, kind: str | None = None, *, size: tuple[int, int] | None = None) -> GeneratedPair:
+def generate_pair(
+    seed: int, kind: str | None = None, *, size: tuple[int, int] | None = None, assets: Assets | None = None
+) -> GeneratedPair:
     """Render the pair that a seed stands for.
 
     Parameters
@@ -119,6 +122,9 @@ def generate_pair(seed: int, kind: str | None = None, *, size: tuple[int, int] |
         One of `KINDS`, else that of `kind_of`.
     size : (int, int), optional
         Width and height in pixels, instead of those drawn; the scene stays the same.
+    assets : Assets, optional
+        Photographs and models to use too, of `stereokit_evaluation.synthetic.assets.read_assets`; other assets, other
+        scenes. A ``"street"`` uses none.
 
     Returns
     -------
@@ -158,14 +164,19 @@ def generate_pair(seed: int, kind: str | None = None, *, size: tuple[int, int] |
     if kind == "street":
         pair = _street(seed, width, height, rig.largest, (left, right), noise)
     else:
-        stage = Stage(world)
+        stage = Stage(world, assets=assets)
         _MAKERS[kind](stage)
         pair = render(stage, rig, noise)
     return GeneratedPair(pair.left, pair.right, pair.truth, pair.seen, kind, seed)
 
 
 def pairs(
-    count: int, first_seed: int = 0, *, kind: str | None = None, folder: Path | None = None
+    count: int,
+    first_seed: int = 0,
+    *,
+    kind: str | None = None,
+    folder: Path | None = None,
+    assets: Assets | None = None,
 ) -> Iterator[GeneratedPair]:
     """Render the pairs of `count` seeds, one after the other.
 
@@ -178,8 +189,10 @@ def pairs(
     kind : str, optional
         Of all of them, else each seed draws its own.
     folder : Path, optional
-        Folder of the pairs, one file each, named by kind, seed and a digest of the sources; existing files are read,
-        not rendered. A stopped run resumes where it ended.
+        Folder of the pairs, one file each, of `pair_name`; existing files are read, not rendered. A stopped run resumes
+        where it ended.
+    assets : Assets, optional
+        As for `generate_pair`.
 
     Yields
     ------
@@ -187,17 +200,28 @@ def pairs(
     """
     for seed in range(_checked("first_seed", first_seed), first_seed + _checked("count", count)):
         if folder is None:
-            yield generate_pair(seed, kind)
+            yield _generate(seed, kind, assets)
             continue
-        path = make_folder(folder, "folder") / f"{kind or kind_of(seed)}-{seed}-{_sources()}.npz"
+        path = make_folder(folder, "folder") / pair_name(seed, kind, assets)
         if not path.exists():
-            pair = generate_pair(seed, kind)
+            pair = _generate(seed, kind, assets)
             buffer = io.BytesIO()
             np.savez(buffer, allow_pickle=False, left=pair.left, right=pair.right, truth=pair.truth, seen=pair.seen)
             write_bytes(path, buffer.getvalue())
         with np.load(path) as stored:
             left, right, truth, seen = (stored[name] for name in ("left", "right", "truth", "seen"))
         yield GeneratedPair(left, right, truth, seen, kind or kind_of(seed), seed)
+
+
+def _generate(seed: int, kind: str | None, assets: Assets | None) -> GeneratedPair:
+    return generate_pair(seed, kind) if assets is None else generate_pair(seed, kind, assets=assets)
+
+
+def pair_name(seed: int, kind: str | None = None, assets: Assets | None = None) -> str:
+    """Return the name of a pair's file: its kind, its seed, and digests of the sources and of the assets it may use."""
+    kind = kind or kind_of(seed)
+    uses = "" if assets is None or kind == "street" else f"-{assets.digest}"
+    return f"{kind}-{seed}-{_sources()}{uses}.npz"
 
 
 def _sources() -> str:

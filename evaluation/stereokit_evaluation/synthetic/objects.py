@@ -6,7 +6,7 @@ import numpy as np
 
 from stereokit_evaluation.synthetic.meshes import heightfield, rotation, sheet
 from stereokit_evaluation.synthetic.stage import Stage
-from stereokit_evaluation.synthetic.things import SOLIDS, solid
+from stereokit_evaluation.synthetic.things import loose, solid
 
 __all__ = ["flying", "pile", "studio_light"]
 
@@ -88,7 +88,7 @@ def pile(stage: Stage) -> None:
         z = rng.uniform(near, far)
         size = float(np.exp(rng.uniform(np.log(0.06), np.log(0.55))))
         turn = rotation(*(rng.normal(0, 1, 3) * np.array([1.0, 0.15, 0.15]))) if upright else None
-        maker = SOLIDS[int(rng.integers(len(SOLIDS)))]
+        maker = loose(stage)
         low = rng.random() < 0.6
         y = -size / 2 if low else -rng.uniform(0.0, 1.3)
         maker(

@@ -9,7 +9,7 @@ from stereokit_evaluation.synthetic.meshes import blob, box, cards, heightfield,
 from stereokit_evaluation.synthetic.roadside import car, fence, front, hedge, pole
 from stereokit_evaluation.synthetic.stage import Stage
 from stereokit_evaluation.synthetic.terrain import relief
-from stereokit_evaluation.synthetic.things import bumps, solid, tree, wire
+from stereokit_evaluation.synthetic.things import bumps, solid, standing, tree, wire
 
 __all__ = ["garden", "road"]
 
@@ -123,6 +123,12 @@ def road(stage: Stage) -> None:
         x = float(rng.choice([-1, 1])) * (half + rng.uniform(-0.5, 1.5))
         solid(stage, size, np.array([x, -size / 2, rng.uniform(4, 25)]), rotation(float(rng.uniform(-3, 3))))
 
+    def beside() -> Float:
+        """Return a place beside the road."""
+        return np.array([float(rng.choice([-1, 1])) * (half + rng.uniform(-0.5, 4)), 0, rng.uniform(3, 25)])
+
+    standing(stage, 12, 0.5, 3.0, beside)
+
 
 def garden(stage: Stage) -> None:
     """Fill `stage` with rough ground, plants, rocks, walls, fences: nature, parks, yards, work sites."""
@@ -190,6 +196,7 @@ def garden(stage: Stage) -> None:
     for _ in range(int(rng.integers(0, 14))):
         size = float(np.exp(rng.uniform(np.log(0.2), np.log(1.3))))
         solid(stage, size, on(*spot()) - [0, size / 2, 0], rotation(float(rng.uniform(-3, 3))))
+    standing(stage, 12, 0.4, 3.0, lambda: on(*spot()))
     for _ in range(int(rng.integers(0, 4))):
         pole(stage, on(*spot()))
     if rng.random() < 0.3:

@@ -7,7 +7,7 @@ import numpy as np
 from stereokit_evaluation.synthetic.meshes import box, heightfield, rotation, sheet
 from stereokit_evaluation.synthetic.objects import studio_light
 from stereokit_evaluation.synthetic.stage import Stage
-from stereokit_evaluation.synthetic.things import bookshelf, chair, lamp, plant, solid, table, wire
+from stereokit_evaluation.synthetic.things import bookshelf, chair, lamp, plant, solid, standing, table, wire
 
 __all__ = ["hall", "room"]
 
@@ -115,6 +115,7 @@ def room(stage: Stage) -> None:
     for _ in range(int(rng.integers(0, 12))):
         size = float(np.exp(rng.uniform(np.log(0.15), np.log(1.0))))
         solid(stage, size, spot() + np.array([0, -size / 2, 0]), rotation(float(rng.uniform(-3, 3))))
+    standing(stage, 10, 0.5, 2.2, spot)
     if rng.random() < 0.35:
         coat = stage.paint(plain=True, albedo=float(rng.uniform(0.02, 0.5)))
         for _ in range(int(rng.integers(1, 6))):
@@ -223,6 +224,7 @@ def hall(stage: Stage) -> None:
     for _ in range(int(rng.integers(2, 16))):
         size = float(np.exp(rng.uniform(np.log(0.2), np.log(1.8))))
         solid(stage, size, spot() - np.array([0, size / 2, 0]), rotation(float(rng.uniform(-3, 3))))
+    standing(stage, 16, 0.5, 3.0, spot)
     for _ in range(int(rng.integers(0, 6))):
         a, b = spot(), spot()
         a[1], b[1] = -height * rng.uniform(0.4, 1, 2)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit_evaluation.synthetic.bank import KINDS, pyramid
+from stereokit_evaluation.synthetic.assets import Assets
+from stereokit_evaluation.synthetic.bank import KINDS, cropped, halvings, pyramid
 from stereokit_evaluation.synthetic.cutouts import mask
 from stereokit_evaluation.synthetic.meshes import Mesh, merge, rotation
 from stereokit_evaluation.synthetic.shading import LIGHT, MATERIAL
@@ -18,6 +19,7 @@ Float = NDArray[np.float64]
 Rng = np.random.Generator
 
 _PER_KIND = 24  # textures of a kind in the bank
+_OWN_ANY, _OWN_PHOTOGRAPH = 0.25, 0.8  # how often a texture is of the assets: of any kind, and a photograph
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,8 @@ class Stage:
         Shift the right view so that the smallest disparity is small, as rectified pictures of a far scene are.
     base_ratio : float
         The baseline over the smallest distance stays below this.
+    assets : Assets or None
+        Photographs and models to use beside those that are computed.
     """
 
     rng: Rng
@@ -75,10 +79,13 @@ class Stage:
     fickle: float = 0.0
     offset: bool = False
     base_ratio: float = 0.4
+    assets: Assets | None = None
     _parts: list[tuple[Mesh, int, int]] = field(default_factory=list)
     _materials: list[Float] = field(default_factory=list)
     _textures: dict[tuple[str, int], int] = field(default_factory=dict)
     _masks: dict[tuple[str, int], int] = field(default_factory=dict)
+    _pictures: dict[tuple[str, int], NDArray[np.uint8]] = field(default_factory=dict)
+    _holes: dict[tuple[str, int], NDArray[np.uint8]] = field(default_factory=dict)
 
     def look(self, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> None:
         """Turn the camera: to the right, upwards, and about its axis; radians."""
@@ -86,10 +93,27 @@ class Stage:
 
     def slot(self, kind: str | None = None) -> int:
         """Return where a texture of a kind lies among those in use; drawn if not there yet."""
+        if self.assets is not None and self.assets.photographs and kind in (None, "photograph"):
+            if self.rng.random() < (_OWN_ANY if kind is None else _OWN_PHOTOGRAPH):
+                return self._own_photograph(self.assets)
         if kind is None:
             names = list(KINDS)
             kind = names[int(self.rng.integers(len(names)))]
         key = (kind, int(self.rng.integers(_PER_KIND)))
+        return self._textures.setdefault(key, len(self._textures))
+
+    def _own_photograph(self, assets: Assets) -> int:
+        number, part = int(self.rng.integers(len(assets.photographs))), int(self.rng.integers(4))
+        key = ("photograph of the assets", 4 * number + part)
+        if key not in self._textures:
+            rng = np.random.default_rng([13, number, part])
+            self._pictures[key] = halvings(cropped(assets.photograph(number), rng))
+        return self._textures.setdefault(key, len(self._textures))
+
+    def picture(self, key: tuple[str, int], image: NDArray[np.uint8]) -> int:
+        """Return the slot of a texture (512, 512) of one's own, known by `key`."""
+        if key not in self._textures:
+            self._pictures[key] = halvings(image)
         return self._textures.setdefault(key, len(self._textures))
 
     def paint(
@@ -155,17 +179,41 @@ class Stage:
         self._materials.append(row)
         return len(self._materials) - 1
 
+    def repaint(
+        self, material: int, albedo: float, *, gloss: float = 0.0, clear: float = 0.0, slot: int = -1, size: float = 1.0
+    ) -> int:
+        """Return a new material: as `material`, of another brightness, maybe with a texture of its own.
+
+        Parameters
+        ----------
+        material : int
+            Of `paint`.
+        albedo, gloss, clear : float
+            As for `paint`.
+        slot, size : int and float
+            A texture of `picture`, laid as it is, -1 to keep that of `material`; one repeat covers `size` metres.
+        """
+        row = self._materials[material].copy()
+        row[5], row[11], row[15] = albedo, max(row[11], gloss), clear
+        if slot >= 0:
+            row[:7] = slot, 1 / size, 0.0, 0.0, 0.0, 0.5, 1.0
+        self._materials.append(row)
+        return len(self._materials) - 1
+
     def add(
         self,
         mesh: Mesh,
         material: int,
-        cut: str | None = None,
+        cut: str | tuple[tuple[str, int], NDArray[np.uint8]] | None = None,
         turn: Float | None = None,
         shift: tuple[float, float, float] | Float = (0.0, 0.0, 0.0),
     ) -> None:
-        """Put a mesh into the scene; `cut` names a kind of mask."""
+        """Put a mesh into the scene; `cut` names a kind of mask, or is a key and one's own mask (256, 256)."""
         number = -1
-        if cut is not None:
+        if isinstance(cut, tuple):
+            self._holes[cut[0]] = cut[1]
+            number = self._masks.setdefault(cut[0], len(self._masks))
+        elif cut is not None:
             number = self._masks.setdefault((cut, int(self.rng.integers(16))), len(self._masks))
         self._parts.append((mesh.moved(turn, tuple(float(v) for v in shift)), material, number))
 
@@ -173,7 +221,8 @@ class Stage:
         """Return everything as arrays."""
         lengths = [len(mesh.faces) for mesh, _, _ in self._parts]
         world = merge([mesh for mesh, _, _ in self._parts])
-        masks = [mask(*key) for key in self._masks] or [np.ones((256, 256), np.uint8)]
+        holes = self._holes
+        masks = [holes[key] if key in holes else mask(*key) for key in self._masks] or [np.ones((256, 256), np.uint8)]
         seen = Mesh(
             _snapped((world.points - self.place) @ self.turn), _snapped(world.normals @ self.turn), _snapped(world.uv),
             world.faces,
@@ -184,7 +233,9 @@ class Stage:
             mask=np.repeat(np.array([part[2] for part in self._parts], np.int32), lengths),
             masks=np.stack(masks),
             materials=_snapped(np.stack(self._materials)),
-            bank=np.concatenate([pyramid(*key) for key in self._textures]),
+            bank=np.concatenate(
+                [self._pictures[key] if key in self._pictures else pyramid(*key) for key in self._textures]
+            ),
         )
 
     def lights(self, *, right: bool = False) -> Float:

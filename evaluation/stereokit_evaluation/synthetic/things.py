@@ -8,12 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit_evaluation.synthetic.cutouts import CUTS
-from stereokit_evaluation.synthetic.meshes import blob, box, cards, lathe, rotation, sheet, tube
+from stereokit_evaluation.synthetic.meshes import Mesh, blob, box, cards, lathe, rotation, sheet, tube
 from stereokit_evaluation.synthetic.stage import Stage
 
-__all__ = ["SOLIDS", "bookshelf", "chair", "fur", "lamp", "plant", "solid", "sticks", "table", "tree", "wire"]
+__all__ = [
+    "SOLIDS",
+    "bookshelf",
+    "chair",
+    "fur",
+    "has_models",
+    "lamp",
+    "loose",
+    "model",
+    "plant",
+    "solid",
+    "standing",
+    "sticks",
+    "table",
+    "tree",
+    "wire",
+]
 
 Float = NDArray[np.float64]
+_Maker = Callable[[Stage, float, Float, Float], None]
+
+_MODEL_SHARE = 0.6  # of loose things, where there are models
+_BARE_SHARE = 0.25  # of models: painted like other things, not with their own pictures
 
 
 def _coat(stage: Stage, size: float) -> int:
@@ -298,7 +318,47 @@ def fur(stage: Stage, size: float, position: Float, turn: Float) -> None:
     )
 
 
-SOLIDS: tuple[Callable[[Stage, float, Float, Float], None], ...] = (
+def has_models(stage: Stage) -> bool:
+    """Return whether the assets of a stage have models."""
+    return stage.assets is not None and bool(stage.assets.models)
+
+
+def model(stage: Stage, size: float, position: Float, turn: Float) -> None:
+    """Add a model of the assets, drawn by chance; its longest side is `size`.
+
+    An upright one (`turn` is a yaw) stands where a cube of that size would.
+    """
+    rng, assets = stage.rng, stage.assets
+    assert assets is not None
+    number = int(rng.integers(len(assets.models)))
+    shape = assets.model(number)
+    bare = bool(rng.random() < _BARE_SHARE)
+    coat = _coat(stage, size)
+    points = shape.points.astype(np.float64) * size
+    if turn[1, 1] > 1 - 1e-9:
+        position = position + np.array([0.0, size / 2 - points[:, 1].max(), 0.0])
+    for row, (albedo, clear, gloss, picture, repeat) in enumerate(shape.looks):
+        triangles = np.flatnonzero(shape.part == row)
+        if not len(triangles):
+            continue
+        corners = slice(3 * triangles[0], 3 * triangles[-1] + 3)
+        uv = shape.uv[corners].astype(np.float64)
+        own = picture >= 0
+        step = size * repeat if own else size  # coordinates are repeats of a picture, or parts of the size
+        slot, cut = -1, None
+        if own:
+            key = (f"model {number}", int(picture))
+            if not bare:
+                slot = stage.picture(key, shape.pictures[int(picture)])
+            if not shape.holes[int(picture)].all():
+                cut = (key, shape.holes[int(picture)])
+        material = stage.repaint(coat, albedo, gloss=gloss, clear=clear, slot=slot, size=step)
+        faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
+        mesh = Mesh(points[corners], shape.normals[corners].astype(np.float64), np.hstack([uv * step, uv]), faces)
+        stage.add(mesh, material, cut, turn, position)
+
+
+SOLIDS: tuple[_Maker, ...] = (
     _box,
     _ball,
     _lump,
@@ -314,7 +374,22 @@ SOLIDS: tuple[Callable[[Stage, float, Float, Float], None], ...] = (
 """Makers of loose things: called with the stage, a size, a place, and a turn."""
 
 
+def standing(stage: Stage, most: int, low: float, high: float, spot: Callable[[], Float]) -> None:
+    """Add up to `most` models of the assets, `low` to `high` metres large, that stand at places that `spot` draws."""
+    rng = stage.rng
+    for _ in range(int(rng.integers(most // 4, most)) if has_models(stage) else 0):
+        size = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        model(stage, size, spot() - np.array([0, size / 2, 0]), rotation(float(rng.uniform(-3, 3))))
+
+
+def loose(stage: Stage) -> _Maker:
+    """Return the maker of a loose thing, drawn by chance: one of `SOLIDS`, or `model`."""
+    if has_models(stage) and stage.rng.random() < _MODEL_SHARE:
+        return model
+    return SOLIDS[int(stage.rng.integers(len(SOLIDS)))]
+
+
 def solid(stage: Stage, size: float, position: Float, turn: Float | None = None) -> None:
     """Add a thing of any kind."""
-    maker = SOLIDS[int(stage.rng.integers(len(SOLIDS)))]
+    maker = loose(stage)
     maker(stage, size, position, rotation(*stage.rng.uniform(-3.1, 3.1, 3)) if turn is None else turn)

@@ -26,7 +26,9 @@ from stereokit.io import make_folder
 from stereokit.notices import collecting
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data.frame import Frame
-from stereokit_evaluation.synthetic.generated import pairs
+from stereokit_evaluation.synthetic.assets import Assets
+from stereokit_evaluation.synthetic.generated import pair_name, pairs
+from stereokit_evaluation.training.generated import stored_assets
 from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of
 from stereokit_refiners.learned import LearnedRefiner
 from stereokit_refiners.weights import WeightFile, read
@@ -85,7 +87,7 @@ class RealFrames:
 
 def train_general(
     output: Path, count: int, real: RealFrames | None = None, *, start: Path | None = None,
-    settings: Sequence[str] = (), cache: Path | None = None,
+    settings: Sequence[str] = (), cache: Path | None = None, assets: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Train the general refiner; killed, it goes on when called again with the same options.
 
@@ -104,6 +106,8 @@ def train_general(
         of `stereokit_refiners.training.evidence.LOSSES`.
     cache : Path, optional
         Folder of pairs and samples; by default ``output/cache``.
+    assets : Path, optional
+        Folder of photographs and models for the generated scenes.
 
     Returns
     -------
@@ -124,7 +128,8 @@ def train_general(
     cache = output / "cache" if cache is None else cache
     for name, folder in (("output", output), ("cache", cache)):
         make_folder(name, folder)
-    generated = _generated_samples(count, cache) if count else None
+    shown = stored_assets(assets, cache)
+    generated = _generated_samples(count, cache, shown) if count else None
     stored = _frame_samples(real, cache / "frames")
     results = []
     for number, (training, held_out) in enumerate(real.groups):
@@ -140,6 +145,7 @@ def train_general(
             "frames": sorted([*(f"{real.dataset}/{frame.name}" for frame in training), *real.extra]),
             "generated": count, "first_seed": FIRST_SEED, "settings": chosen,
             "start": None if start is None else read(start).fingerprint,
+            **({} if shown is None else {"assets": shown.notes}),
         }  # fmt: skip
         with redirect_stdout(sys.stderr):  # what it reports on the way is no result
             content = evidence.fit(
@@ -151,19 +157,20 @@ def train_general(
         results.append({"folder": str(folder), "held_out": [frame.name for frame in held_out], "bad_and_known": counts})
     return {
         "refiner": GENERAL[0], "settings": chosen, "methods": list(real.methods), "generated": count,
+        "assets": None if shown is None else shown.notes,
         "frames": sorted(real.training), "results": results, "rank": 0,
     }  # fmt: skip
 
 
-def _generated_samples(count: int, cache: Path) -> Path:
+def _generated_samples(count: int, cache: Path, assets: Assets | None) -> Path:
     """Render what is missing of the pairs, and of their samples; return the folder of the samples."""
     from stereokit_refiners.training import evidence
 
     with progress(count * (1 + _SAMPLES)) as (_, step):
         rendered = cache / "pairs"
-        for pair in pairs(count, FIRST_SEED, folder=rendered):
+        for pair in pairs(count, FIRST_SEED, folder=rendered, assets=assets):
             step(f"{pair.kind} {pair.seed}")
-        exact, samples = _exactly(rendered, count, cache)
+        exact, samples = _exactly(rendered, count, cache, assets)
         for number in range(_SAMPLES):
             evidence._store(exact, samples, number + 1)
             step(f"samples {number + 1} of each pair", count)
@@ -211,17 +218,9 @@ def _score(content: WeightFile, frames: Sequence[Frame], real: RealFrames) -> di
     return counts
 
 
-def _exactly(rendered: Path, count: int, cache: Path) -> tuple[Path, Path]:
+def _exactly(rendered: Path, count: int, cache: Path, assets: Assets | None = None) -> tuple[Path, Path]:
     """Return a folder that holds these pairs and no others, and one for their samples."""
-    names = sorted(path.name for path in rendered.glob("*.npz"))
-    wanted = [name for name in names if FIRST_SEED <= int(name.split("-")[1]) < FIRST_SEED + count]
-    newest: dict[str, Path] = {}
-    for name in wanted:  # of a seed that was rendered by other sources too, the last counts
-        path = rendered / name
-        seed = name.split("-")[1]
-        if seed not in newest or path.stat().st_mtime_ns >= newest[seed].stat().st_mtime_ns:
-            newest[seed] = path
-    chosen = sorted(newest.values())
+    chosen = sorted(rendered / pair_name(seed, assets=assets) for seed in range(FIRST_SEED, FIRST_SEED + count))
     key = f"{zlib.crc32('/'.join(path.name for path in chosen).encode()):08x}"
     exact, samples = cache / f"pairs-{key}", cache / f"samples-{key}"
     for folder in (exact, samples):

@@ -8,14 +8,30 @@ from pathlib import Path
 
 import numpy as np
 
+from stereokit_evaluation.common.progress import progress
+from stereokit_evaluation.synthetic.assets import Assets, read_assets
 from stereokit_evaluation.synthetic.generated import pairs
 from stereokit_evaluation.training.pairs import FIRST_SEED
 from stereokit_refiners.training.samples import Pair
 
-__all__ = ["generated_pairs", "levels_for"]
+__all__ = ["generated_pairs", "levels_for", "stored_assets"]
 
 
-def generated_pairs(count: int, folder: Path) -> Iterator[Pair]:
+def stored_assets(folder: Path | None, cache: Path) -> Assets | None:
+    """Read the folder of assets, if there is one; what scenes read of it is stored in ``cache/assets``.
+
+    Raises
+    ------
+    OptionError, FileError, StereokitError
+        As `read_assets`.
+    """
+    if folder is None:
+        return None
+    with progress(None) as (_, step):
+        return read_assets(folder, cache / "assets", step)
+
+
+def generated_pairs(count: int, folder: Path, assets: Assets | None = None) -> Iterator[Pair]:
     """Yield generated pairs as pairs for training; each is rendered once and stored in a folder.
 
     Parameters
@@ -23,8 +39,10 @@ def generated_pairs(count: int, folder: Path) -> Iterator[Pair]:
     count : int
         How many; seeds start at `stereokit_evaluation.training.pairs.FIRST_SEED`.
     folder : Path
+    assets : Assets, optional
+        Photographs and models for the scenes.
     """
-    for pair in pairs(count, FIRST_SEED, folder=folder):
+    for pair in pairs(count, FIRST_SEED, folder=folder, assets=assets):
         yield Pair(f"{pair.kind}-{pair.seed}", pair.left, pair.right, pair.noc, pair.occ)
 
 

@@ -23,8 +23,9 @@ from stereokit.methods import check_levels, parse_method
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data.datasets import load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
+from stereokit_evaluation.synthetic.assets import check_assets
 from stereokit_evaluation.training.general import GENERAL, RealFrames, train_general
-from stereokit_evaluation.training.generated import generated_pairs, levels_for
+from stereokit_evaluation.training.generated import generated_pairs, levels_for, stored_assets
 from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of, scene_pair
 
 __all__ = ["run_training"]
@@ -37,7 +38,7 @@ def run_training(
     frames: str | None = None, validation: str | None = None, folds: str | None = None, extra: Sequence[str] = (),
     extra_share: float = 0.2, streets: int = 0, generated: int = 0, street_share: float = 0.5,
     method: Sequence[str] = _MATCHERS, variants: int = 9, start: Path | None = None, preset: str = "default",
-    settings: Sequence[str] = (), max_disparity: int = 128, cache: Path | None = None,
+    settings: Sequence[str] = (), max_disparity: int = 128, cache: Path | None = None, assets: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Train a refiner; after a kill, the same call resumes from the checkpoint.
 
@@ -69,6 +70,8 @@ def run_training(
         Disparities of the matchers, full-size pixels.
     cache : Path, optional
         Folder of coarse maps; by default ``output/cache``.
+    assets : Path, optional
+        Folder of photographs and models that generated pairs may show.
 
     Returns
     -------
@@ -85,6 +88,10 @@ def run_training(
     check_integer("generated", generated, 0)
     if general and streets:
         raise OptionError(f"streets must be 0 for refiner {refiner!r}, whose generated pairs hold some, got {streets}")
+    if assets is not None:
+        check_assets(assets)
+        if generated < 1:
+            raise OptionError(f"assets must come with generated pairs, got {str(assets)!r} and none of them")
     from stereokit_refiners.networks.layers import output_rule
     from stereokit_refiners.training.loop import Source
     from stereokit_refiners.training.samples import SampleFiles, store_variant
@@ -127,12 +134,13 @@ def run_training(
             groups, dataset, extra_frames, methods, variants, max_disparity, extra_share, street_share,
             folds=folds is not None,
         )  # fmt: skip
-        document = train_general(output, generated, real, start=start, settings=settings, cache=cache)
+        document = train_general(output, generated, real, start=start, settings=settings, cache=cache, assets=assets)
         return document | {"streets": 0, "pooled": _pooled(document["results"], methods)}
     if cache is not None:
         make_folder("cache", cache)
     make_folder("output", output)
     cache_folder = output / "cache" if cache is None else cache
+    own = stored_assets(assets, cache_folder)
     world = _join_group(torch)
 
     def stored(frame: Frame, numbers: range, step: Callable[..., None]) -> list[Path]:
@@ -156,7 +164,7 @@ def run_training(
 
     def stored_pairs(step: Callable[..., None]) -> list[Path]:
         paths = []
-        for pair in generated_pairs(generated, cache_folder / "pairs"):
+        for pair in generated_pairs(generated, cache_folder / "pairs", own):
             levels = max(max_disparity, levels_for(pair))
             for n, name in itertools.product((0, 1), methods):
                 paths.append(store_variant(pair, name, training_settings.seed, n, levels, cache_folder))
@@ -194,11 +202,12 @@ def run_training(
             world,
             trained_on,
             max_disparity,
+            {} if own is None else {"assets": own.notes},
         )
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})
     return {
         "refiner": refiner, "settings": asdict(training_settings), "methods": methods, "streets": streets,
-        "generated": generated,
+        "generated": generated, "assets": None if own is None else own.notes,
         "frames": sorted(training_frames), "results": results, "pooled": _pooled(results, methods), "rank": world[0],
     }  # fmt: skip
 
@@ -270,6 +279,7 @@ def _join_group(torch: Any) -> tuple[int, int]:
 def _train_one(
     refiner: str, sources: Any, held_out_samples: Sequence[Any], labels: Sequence[tuple[str, str]], settings: Any,
     start: Any, folder: Path, world: tuple[int, int], trained_on: Sequence[str], max_disparity: int,
+    assets: dict[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
     """Train, calibrate, write the folder; return the counts of bad and known pixels by matcher."""
     from stereokit_refiners.training.loop import bad_pixels, calibrated, fit, predict, restored
@@ -304,6 +314,7 @@ def _train_one(
             "frames": sorted(trained_on),
             "settings": asdict(settings),
             "start": None if start is None else start.fingerprint,
+            **assets,
         }
         write(folder / "weights.safetensors", WeightFile(refiner, settings.output_mode, arrays, ranges, notes))
         write_bytes(folder / "curves.csv", history.csv())

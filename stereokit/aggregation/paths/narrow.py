@@ -51,11 +51,14 @@ class NarrowBuffers(NamedTuple):
 
 
 @kernel
-def start_narrow(buffers: NarrowBuffers) -> None:
-    """Begin a sweep: no path has come from anywhere yet."""
+def start_narrow(buffers: NarrowBuffers, x0: int, x1: int) -> None:
+    """Begin a sweep in columns x0..x1: no path has come from anywhere yet."""
     zero = splat(np.uint8(0))
-    for at in range(0, buffers.paths.state.size, LANES):
-        store(buffers.paths.state, at, zero)
+    for direction in range(3):
+        if direction == 1 or len(buffers.paths.diagonals) > 0:
+            first = direction * buffers.paths.width
+            for x in range(first + x0, first + x1):
+                store(buffers.paths.state, LANES + x * LANES, zero)
 
 
 @inline
@@ -148,12 +151,12 @@ def _row_before(buffers: NarrowBuffers, guide: NDArray[np.uint8], y: int, step: 
 
 
 @inline
-def _narrow_costs(rows: Any, buffers: NarrowBuffers, y: int, to: int) -> None:
-    """Write the costs of row `y`, those of unexpected levels raised, to element `to` of the buffers."""
+def _narrow_costs(rows: Any, buffers: NarrowBuffers, y: int, x0: int, x1: int, to: int) -> None:
+    """Write the costs of a part of row `y`, those of unexpected levels raised; the row's are at element `to`."""
     width = buffers.paths.width
     costs = buffers.paths.cost
-    cost_row(rows, y, costs[to : to + width * LANES])
-    for x in range(width):
+    cost_row(rows, y, x0, x1, costs[to : to + width * LANES])
+    for x in range(x0, x1):
         low = np.int64(buffers.search.low[y * width + x])
         high = np.int64(buffers.search.high[y * width + x])
         unexpected = add(load(buffers.below, LANES - low), load(buffers.above, LANES - high))
@@ -162,23 +165,22 @@ def _narrow_costs(rows: Any, buffers: NarrowBuffers, y: int, to: int) -> None:
 
 @kernel
 def first_narrow_visit(
-    rows: Any, buffers: NarrowBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int,
-    sums: NDArray[Any], near: int,
+    rows: Any, buffers: NarrowBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, x0: int,
+    x1: int, sums: NDArray[Any], near: int,
 ) -> None:  # fmt: skip
-    """Sweep from row `y0` to before row `y1` (upwards when y1 < y0); leave the brackets in `sums`.
-
-    The last `near` elements are written through the caches, all before them past the caches.
-    """
+    """Sweep a part of the rows; see `stereokit.aggregation.paths.visits.first_visit`."""
+    start_narrow(buffers, x0, x1)
     step = 1 if y1 > y0 else -1
     width = buffers.paths.width
     for k in range(abs(y1 - y0)):
         y = y0 + k * step
         here = y * width
         before = _row_before(buffers, guide, y, step)
-        _narrow_costs(rows, buffers, y, 0)
-        write_penalties(guide, y, step, len(buffers.paths.diagonals) > 0, False, penalties, 0, buffers.paths.penalties)
+        _narrow_costs(rows, buffers, y, x0, x1, 0)
+        diagonals = len(buffers.paths.diagonals) > 0
+        write_penalties(guide, y, x0, x1, step, diagonals, False, penalties, 0, buffers.paths.penalties)
         bypass = (abs(y1 - y0) - k) * width * LANES > near
-        for x in range(width):
+        for x in range(x0, x1):
             cost = load(buffers.paths.cost, x * LANES)
             brackets = _from_row_before(buffers, x, k % width, here + x, before + x, x, cost, sums[0])
             if bypass:
@@ -250,9 +252,10 @@ def prepare_narrow_rows(
     paths = buffers.paths
     size = paths.width * LANES
     for n in range(count):
-        _narrow_costs(rows, buffers, y + n * step, n * size)
+        _narrow_costs(rows, buffers, y + n * step, 0, paths.width, n * size)
         place = 8 * n * paths.width
-        write_penalties(guide, y + n * step, step, len(paths.diagonals) > 0, True, penalties, place, paths.penalties)
+        diagonals = len(paths.diagonals) > 0
+        write_penalties(guide, y + n * step, 0, paths.width, step, diagonals, True, penalties, place, paths.penalties)
     _horizontals(buffers, y * paths.width, (y + step) * paths.width, count)
 
 

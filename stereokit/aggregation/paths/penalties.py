@@ -57,18 +57,22 @@ def _penalise_from(
 
 @inline
 def write_penalties(
-    guide: NDArray[np.uint8], y: int, step: int, diagonals: bool, along: bool, penalties: Penalties, start: int,
-    out: NDArray[np.uint8],
+    guide: NDArray[np.uint8], y: int, x0: int, x1: int, step: int, diagonals: bool, along: bool, penalties: Penalties,
+    start: int, out: NDArray[np.uint8],
 ) -> None:  # fmt: skip
     """Write the penalties of row `y` for the steps of the paths from the row before and `along` the row.
 
     They go to ``out[start:]``: P1 and P2 of each pixel for the path from the left, the vertical one, the one from the
-    right, and those along the row.
+    right, and those along the row. Of the vertical path only those of columns x0..x1 are written.
     """
     height, width = guide.shape
     before = min(max(y - step, 0), height - 1)
-    for direction in range(3):
-        if direction == 1 or diagonals:
+    at = start + 2 * width
+    _penalise(
+        guide[y, x0:x1], guide[before, x0:x1], penalties, out[at + x0 : at + x1], out[at + width + x0 : at + width + x1]
+    )
+    if diagonals:
+        for direction in (0, 2):
             _penalise_from(guide, y, before, direction - 1, penalties, start + 2 * direction * width, out)
     if along:
         _penalise_from(guide, y, y, -1, penalties, start + 6 * width, out)

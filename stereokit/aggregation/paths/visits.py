@@ -47,15 +47,16 @@ CHUNK = 32
 
 
 @kernel
-def start(buffers: PathBuffers) -> None:
-    """Begin a sweep: no path has come from anywhere yet."""
+def start(buffers: PathBuffers, x0: int, x1: int) -> None:
+    """Begin a sweep in columns x0..x1: no path has come from anywhere yet."""
     zero = splat(np.uint8(0))
-    size = buffers.width * LANES * len(buffers.blocks)
-    for at in range(
-        0 if len(buffers.diagonals) > 0 else size, 3 * size if len(buffers.diagonals) > 0 else 2 * size, LANES
-    ):
-        store(buffers.state, at, zero)
-    buffers.lowest[:] = 0
+    padded = LANES * len(buffers.blocks)
+    for direction in range(3):
+        if direction == 1 or len(buffers.diagonals) > 0:
+            first = direction * buffers.width
+            for at in range((first + x0) * padded, (first + x1) * padded, LANES):
+                store(buffers.state, at, zero)
+            buffers.lowest[first + x0 : first + x1] = 0
 
 
 @inline
@@ -110,8 +111,8 @@ def _horizontals(buffers: PathBuffers, rows: int) -> None:
 
 
 @inline
-def _leave_row(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, bypass: bool) -> None:
-    """Take the paths from the row before to the `k`-th row of the first visit.
+def _leave_row(buffers: PathBuffers, k: int, x0: int, x1: int, sums: NDArray[Any], base: int, bypass: bool) -> None:
+    """Take the paths from the row before to columns x0..x1 of the `k`-th row of the first visit.
 
     The sum of their brackets, or the vertical path's costs where costs are recovered from them, goes to
     ``sums[base:]``: past the caches, if `bypass`, or through them.
@@ -120,7 +121,7 @@ def _leave_row(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, bypa
     padded = LANES * len(buffers.blocks)
     like = sums[0]
     turn = k % width
-    for x in range(width):
+    for x in range(x0, x1):
         slots = slots_of(width, turn, x)
         restart_diagonals(buffers, slots, x)
         paths = enter_paths(buffers, slots, x)
@@ -139,23 +140,25 @@ def _leave_row(buffers: PathBuffers, k: int, sums: NDArray[Any], base: int, bypa
 
 @kernel
 def first_visit(
-    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int,
+    rows: Any, buffers: PathBuffers, guide: NDArray[np.uint8], penalties: Penalties, y0: int, y1: int, x0: int, x1: int,
     sums: NDArray[Any], near: int,
 ) -> None:  # fmt: skip
-    """Sweep from row `y0` to before row `y1` (upwards when y1 < y0); leave the brackets in `sums`.
+    """Sweep columns x0..x1 from row `y0` to before row `y1` (upwards when y1 < y0); leave the brackets in `sums`.
 
-    The last `near` elements are written through the caches, all before them past the caches.
+    Columns do not depend on one another unless there are diagonal paths, which take all of them at a time. The last
+    `near` elements of whole rows are written through the caches, all before them past the caches.
     """
+    start(buffers, x0, x1)
     step = 1 if y1 > y0 else -1
     size = buffers.width * LANES * len(buffers.blocks)
     for k in range(abs(y1 - y0)):
         y = y0 + k * step
-        cost_row(rows, y, buffers.cost)
-        write_penalties(guide, y, step, len(buffers.diagonals) > 0, False, penalties, 0, buffers.penalties)
+        cost_row(rows, y, x0, x1, buffers.cost)
+        write_penalties(guide, y, x0, x1, step, len(buffers.diagonals) > 0, False, penalties, 0, buffers.penalties)
         if (abs(y1 - y0) - k) * size > near:
-            _leave_row(buffers, k, sums, y * size, True)
+            _leave_row(buffers, k, x0, x1, sums, y * size, True)
         else:
-            _leave_row(buffers, k, sums, y * size, False)
+            _leave_row(buffers, k, x0, x1, sums, y * size, False)
     stream_fence()
 
 
@@ -175,7 +178,7 @@ def recover_row(
     zero = splat(np.uint8(0))
     before = y + step
     first = before < 0 or before >= guide.shape[0]  # there the other sweep began, with brackets of 0
-    write_penalties(guide, y, -step, False, False, penalties, 0, buffers.penalties)
+    write_penalties(guide, y, 0, width, -step, False, False, penalties, 0, buffers.penalties)
     for x in range(width):
         p1 = splat_at(buffers.penalties, 2 * width + x)
         p2 = splat_at(buffers.penalties, 3 * width + x)
@@ -215,12 +218,13 @@ def prepare_rows(
         if recovers_costs(buffers):
             recover_row(buffers, guide, penalties, y + n * step, step, n * size, sums)
         else:
-            cost_row(rows, y + n * step, buffers.cost[n * size : (n + 1) * size])
+            cost_row(rows, y + n * step, 0, buffers.width, buffers.cost[n * size : (n + 1) * size])
     for n in range(count):
         place = 8 * n * buffers.width
         write_penalties(
-            guide, y + n * step, step, len(buffers.diagonals) > 0, True, penalties, place, buffers.penalties
-        )
+            guide, y + n * step, 0, buffers.width, step, len(buffers.diagonals) > 0, True, penalties, place,
+            buffers.penalties,
+        )  # fmt: skip
     _horizontals(buffers, count)
 
 

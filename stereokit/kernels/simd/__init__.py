@@ -39,6 +39,7 @@ from stereokit.kernels.simd.arithmetic import (
     shift_left,
     shift_right,
     subtract,
+    without_three,
     xor,
 )
 from stereokit.kernels.simd.memory import aligned, load, prefetch, splat, splat_at, store, stream, stream_fence
@@ -81,5 +82,6 @@ __all__ = [
     "stream_fence",
     "subtract",
     "vector_bits",
+    "without_three",
     "xor",
 ]

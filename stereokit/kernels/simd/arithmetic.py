@@ -32,6 +32,7 @@ __all__ = [
     "shift_left",
     "shift_right",
     "subtract",
+    "without_three",
     "xor",
 ]
 
@@ -263,3 +264,23 @@ def lowest(typing: Any, value: Any) -> Any:
         return call_ir(builder, f"llvm.vector.reduce.{kind}.{value.suffix}", value.element, [args[0]])
 
     return value.scalar(value), generate
+
+
+@intrinsic
+def without_three(typing: Any, value: Any, first: Any) -> Any:
+    """Return an integer vector whose lanes `first` to ``first + 2``, as far as there are such, hold the largest value.
+
+    `first` may be from -32768 to 32767.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        vector, start = args
+        words = Vector(types.uint16)
+        begin = splat_ir(builder, builder.trunc(start, words.element), words)
+        behind = builder.sub(ir.Constant(words.llvm, list(range(LANES))), begin)
+        is_one = builder.icmp_unsigned("<", behind, ir.Constant(words.llvm, [3] * LANES))
+        bits = value.element.width
+        most = 2 ** (bits - 1) - 1 if value.scalar.signed else 2**bits - 1
+        return builder.select(is_one, ir.Constant(value.llvm, [most] * LANES), vector)
+
+    return value(value, types.int64), generate

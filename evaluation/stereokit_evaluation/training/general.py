@@ -199,19 +199,18 @@ def _frame_samples(real: RealFrames, folder: Path) -> dict[str, list[Path]]:
 def _score(content: WeightFile, frames: Sequence[Frame], real: RealFrames) -> dict[str, list[int]]:
     """Return how many known pixels are wrong by over 3 pixels and 5 %, and how many are known, by matcher.
 
-    Half size, fp32. What both cameras see counts, where that is known.
+    Half size, fp32. What both cameras see counts.
     """
     refiner = LearnedRefiner.of(content, backend="torch", precision="fp32")
     counts = {method: [0, 0] for method in real.methods}
     with progress(len(frames) * len(real.methods)) as (_, step), collecting():
         for frame in frames:
             pair = pair_of(frame)
-            truth = pair.noc if np.isfinite(pair.noc).any() else pair.occ
-            known = np.isfinite(truth)
+            known = np.isfinite(pair.noc)
             for method, count in counts.items():
                 match = stereokit.Matcher(method, max_disparity=real.max_disparity, scale=0.5, refiner=refiner)
-                error = np.abs(match(pair.left, pair.right).disparity - truth)
-                right = (error <= 3) | (error <= np.float32(0.05) * truth)
+                error = np.abs(match(pair.left, pair.right).disparity - pair.noc)
+                right = (error <= 3) | (error <= np.float32(0.05) * pair.noc)
                 count[0] += int(np.count_nonzero(known & ~right))
                 count[1] += int(np.count_nonzero(known))
                 step(f"score {frame.name} {method}")

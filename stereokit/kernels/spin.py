@@ -3,7 +3,8 @@
 A stage at half size lasts a few hundred microseconds; to hand its tasks out and to wait for them through the
 interpreter's queues and locks takes 50 to 80. Who looks at a word in memory instead sees its change within a
 microsecond. That uses a processor, so it must not last: after a few microseconds the processor is offered to others
-between two looks, and after a few milliseconds `spin_while` returns, and `wait_until` sleeps between two looks.
+between two looks, after a few hundred who waits sleeps between two looks, and after some milliseconds `spin_while`
+returns.
 
 `claim`, `publish` and `wait_until` let kernels that run side by side work on rows of which each needs the one before.
 Who claims a row works on it until it is done, and waits for rows alone that were claimed earlier: so some thread
@@ -21,7 +22,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from stereokit.kernels.jit import kernel
+from stereokit.kernels.jit import inline, kernel
 
 __all__ = ["WORDS_APART", "claim", "publish", "spin_while", "wait_until"]
 
@@ -30,10 +31,10 @@ WORDS_APART = 8
 
 _BUSY_LOOKS = 256
 """Looks, each some tens of nanoseconds, before the processor is offered to others between looks."""
-_LOOKS = 8_000
-"""Looks in all: a few milliseconds where nobody else wants the processor."""
 _LOOKS_AWAKE = 1_000
-"""Looks of `wait_until` before it sleeps between two: some hundred microseconds."""
+"""Looks before the first sleep between two: a few hundred microseconds where nobody else wants the processor."""
+_SLEEPS = 60
+"""Sleeps of `spin_while`, some milliseconds in all."""
 _SLEEP_MICROSECONDS = 50
 
 
@@ -65,16 +66,6 @@ def _pause(typing: Any, looks: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(types.int64), generate
-
-
-@kernel
-def spin_while(words: NDArray[Any], index: int, value: int) -> bool:
-    """Wait while element `index` of the int64 `words` has this value; return False if it still has it at the end."""
-    for looks in range(_LOOKS):
-        if _look(words, index) != value:
-            return True
-        _pause(looks)
-    return False
 
 
 @intrinsic
@@ -114,13 +105,29 @@ def _sleep(typing: Any, microseconds: Any) -> Any:
     return types.void(types.int64), generate
 
 
+@inline
+def _wait(looks: int) -> None:
+    """Wait for a moment after so many looks."""
+    if looks < _LOOKS_AWAKE:
+        _pause(looks)
+    else:
+        _sleep(_SLEEP_MICROSECONDS)
+
+
+@kernel
+def spin_while(words: NDArray[Any], index: int, value: int) -> bool:
+    """Wait while element `index` of the int64 `words` has this value; return False if it still has it at the end."""
+    for looks in range(_LOOKS_AWAKE + _SLEEPS):
+        if _look(words, index) != value:
+            return True
+        _wait(looks)
+    return False
+
+
 @kernel
 def wait_until(words: NDArray[Any], index: int, value: int) -> None:
     """Wait until element `index` of the int64 `words` is at least `value`."""
     looks = 0
     while _look(words, index) < value:
-        if looks < _LOOKS_AWAKE:
-            _pause(looks)
-        else:
-            _sleep(_SLEEP_MICROSECONDS)
+        _wait(looks)
         looks += 1

@@ -99,6 +99,23 @@ def test_an_error_leaves_the_matcher_usable():
     np.testing.assert_array_equal(matcher(*pair).disparity, expected)
 
 
+def test_map_shares_threads_out_by_what_is_waiting(monkeypatch):
+    seen, call = [], Matcher._call
+
+    def noted(self, left, right, mask, right_mask, threads):
+        seen.append(threads)
+        return call(self, left, right, mask, right_mask, threads)
+
+    monkeypatch.setattr(Matcher, "_call", noted)
+    matcher = Matcher("census+sgm", max_disparity=16, threads=4)
+    (result,) = matcher.map([pair_of(0)])  # as from a camera: one at a time
+    assert seen == [4]
+    np.testing.assert_array_equal(result.disparity, matcher(*pair_of(0)).disparity)
+    seen.clear()
+    assert len(list(matcher.map([pair_of(0)] * 30))) == 30
+    assert sorted(set(seen) - {1, 2, 4}) == [] and seen.count(1) > 10
+
+
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_map_gives_the_results_of_single_calls_in_order(threads):
     pairs = [pair_of(seed, (20 + seed % 3, 40)) for seed in range(11)]

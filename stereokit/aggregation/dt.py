@@ -44,7 +44,7 @@ from stereokit.kernels.simd import (
     load,
     minimum,
     multiply,
-    multiply_high,
+    multiply_high_doubled,
     shift_left,
     shift_right,
     splat,
@@ -209,7 +209,7 @@ def _feed_back(value: Any, before: Any, weight: Any, normalised: Any) -> Any:
     """
     if value.scalar == types.int16:
         return lambda value, before, weight, normalised: add(
-            value, multiply_high(shift_left(subtract(before, value), 1), weight)
+            value, multiply_high_doubled(subtract(before, value), weight)
         )
     return lambda value, before, weight, normalised: add(
         value, multiply(weight, subtract(before, multiply(normalised, value)))
@@ -221,7 +221,7 @@ def _feed_back_up(value: Any, before: Any, weight: Any, normalised: Any) -> Any:
     """Return the value of `_feed_back`, but fixed point rounds up: the way back makes up for the way there."""
     if value.scalar == types.int16:
         return lambda value, before, weight, normalised: subtract(
-            value, multiply_high(shift_left(subtract(value, before), 1), weight)
+            value, multiply_high_doubled(subtract(value, before), weight)
         )
     return lambda value, before, weight, normalised: _feed_back(value, before, weight, normalised)
 

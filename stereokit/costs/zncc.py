@@ -10,10 +10,11 @@ With n pixels in the window, ``rho = (n*sum(LR) - sum(L)*sum(R)) / (sqrt(vL) * s
 multiplied into the left pixel, not into the products. Only the two last factors, ``1 / sqrt(v)``, are floats, and
 the product of the three is rounded once to `steps` levels.
 
-Sums slide: the column sums of the products take one row in and one out, the window takes one column in and one out,
-so the work per cell does not grow with the window. The right pixels of the row that comes and of the one that goes
-lie side by side in one 32-bit lane, and so do their left factors, ``n * new`` and ``-n * old``: one instruction
-(`multiply_pairs`) makes what a column gains, and with the window's own sums in such lanes, what the numerator loses.
+Sums slide: those of the columns take one row in and one out, and a window's is the difference of two sums over all
+columns up to one, so the work per cell does not grow with the window. (These wrap; their difference does not.) The
+right pixels of the row that comes and of the one that goes make pairs, and so do their left factors, ``n * new`` and
+``-n * old``. Where one instruction multiplies pairs and adds the two products, they lie side by side in one 32-bit
+lane (`add_pairs`), and the window's own sums in such lanes, for what the numerator loses.
 
 Bound and measurement for 64 cells (512-bit vectors): column sums are read twice and written once, and the right
 image's pairs, sums and factors are read once, at any alignment: 8 aligned loads at 0.29 ns, 12 others at 0.44 ns and
@@ -38,16 +39,24 @@ from stereokit.images.check import check_integer
 from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import (
     LANES,
+    PART,
     add,
+    add_firsts,
+    add_pairs,
+    add_scaled,
     bits_of,
     convert,
-    load,
+    each_part,
+    load_pairs,
+    load_part,
     maximum,
     multiply,
-    multiply_pairs,
-    splat,
-    splat_at,
+    splat_pair_at,
+    splat_part,
+    splat_part_at,
+    splat_parts,
     store,
+    store_pair,
     subtract,
 )
 from stereokit.kernels.threads import run_stages, spans
@@ -80,9 +89,9 @@ class ColumnSums(NamedTuple):
     """Sums of products over the columns of the windows around one row, which slide with it; of one worker."""
 
     row: NDArray[np.int64]  # (3,): that row, or -1, the first column and the one behind the last
-    sums: NDArray[np.int32]  # n times the sums, element ((d // 64) * C + half + x) * 64 + d % 64
+    sums: NDArray[np.int32]  # n times those of all columns up to c, element ((d // 64) * (C + 1) + c + 1) * 64 + d % 64
     factors: NDArray[np.int32]  # n * left pixels of the row that comes (low half), -n * those of the one that goes
-    pairs: NDArray[np.int32]  # right pixels of the row that comes (low half) and of the one that goes (high half)
+    pairs: NDArray[np.int32]  # right pixels of the row that comes and of the one that goes, as of `store_pair`
 
 
 class ZnccRows(NamedTuple):
@@ -101,7 +110,7 @@ class NarrowZnccRows(NamedTuple):
     """The same for pixels that search `LANES` levels from `starts` on.
 
     Nothing slides from row to row there: `columns` has the pairs and the factors of all rows of a window, two rows to
-    a lane, and `sums` those of the columns of one window.
+    a lane, and `sums` those of the columns of one window, column c in place ``c % window``.
     """
 
     window: ZnccRows
@@ -214,7 +223,7 @@ class Zncc:
             right_width=right_width,
         )
         producers: list[Any] = []
-        sums, pairs = ((width + 2 * half) * padded, 1) if pair.starts is None else (self.window * LANES, half + 1)
+        sums, pairs = ((width + 2 * half + 1) * padded, 1) if pair.starts is None else (self.window * LANES, half + 1)
         for worker in range(workers):
             columns = ColumnSums(
                 row=workspace.array(f"zncc.row{worker}", 3, np.int64),
@@ -325,27 +334,24 @@ def _write_pairs(
     count = min(x1 - x0 + rows.cells.padded + 2 * rows.half, images.right_stride - first)
     new = max(low_row, 0) * images.right_stride + first
     old = max(high_row, 0) * images.right_stride + first
-    at = place * images.right_stride + first
+    at = place * images.right_stride
     right_low = images.right[new : new + count]
     right_high = images.right[old : old + count]
-    pairs = rows.columns.pairs[at : at + count]
     for k in range(count):
-        low = np.int32(right_low[k]) & np.int32(0xFFFF)
-        high = np.int32(np.int32(right_high[k]) << np.int32(16))
-        pairs[k] = np.int32(low | high)
+        store_pair(rows.columns.pairs, at, images.right_stride, first + k, right_low[k], right_high[k])
     count = x1 - x0 + 2 * rows.half
     new = max(low_row, 0) * images.left_stride + x0
     old = max(high_row, 0) * images.left_stride + x0
     at = place * images.left_stride + x0
-    n_low = np.int32(low_n) if low_row >= 0 else np.int32(0)
-    n_high = np.int32(high_n) if high_row >= 0 else np.int32(0)
+    n_low = np.int32(low_n if low_row >= 0 else 0)
+    n_high = np.int32(high_n << 16 if high_row >= 0 else 0)
     left_low = images.left[new : new + count]
     left_high = images.left[old : old + count]
     factors = rows.columns.factors[at : at + count]
     for c in range(count):
-        low = np.int32(n_low * np.int32(left_low[c])) & np.int32(0xFFFF)
-        high = np.int32(np.int32(n_high * np.int32(left_high[c])) << np.int32(16))
-        factors[c] = np.int32(low | high)
+        # Numba multiplies 64 bits; as they are cut once, at the end, LLVM makes it 32, and vectors.
+        low = np.int64(n_low) * np.int64(left_low[c]) & 0xFFFF
+        factors[c] = np.int32(low + np.int64(n_high) * np.int64(left_high[c]))
 
 
 @inline
@@ -355,27 +361,50 @@ def _pair_rows(rows: ZnccRows, x0: int, x1: int, row_in: int, row_out: int) -> N
     _write_pairs(rows, x0, x1, 0, row_in, row_out, n, -n)
 
 
+class _Column(NamedTuple):
+    """A padded column and 64 levels of it, for the steps of a row."""
+
+    rows: ZnccRows
+    c: int
+    block: int  # the first level
+    at: int  # element of the column's sums
+    factors: Any
+
+
 @inline
-def _column(rows: ZnccRows, at: int, c: int, block: int) -> Any:
-    """Bring the sums of padded column `c`, at element `at`, to the row that `pairs` and `factors` lead to."""
-    right = load(rows.columns.pairs, rows.columns.factors.size - 1 - c + block)
-    column = add(load(rows.columns.sums, at), multiply_pairs(right, splat_at(rows.columns.factors, c)))
-    store(rows.columns.sums, at, column)
-    return column
+def _column(rows: ZnccRows, c: int, block: int) -> _Column:
+    columns = rows.columns.factors.size
+    at = (block // LANES * (columns + 1) + c + 1) * LANES
+    return _Column(rows, c, block, at, splat_pair_at(rows.columns.factors, c))
+
+
+@inline
+def _gain(gained: Any, lane: int, column: _Column) -> Any:
+    """Bring the sums up to a column to the row that `pairs` and `factors` lead to.
+
+    `gained` is what those up to the column before have gained; return it with what this one gains.
+    """
+    columns = column.rows.columns
+    k = columns.factors.size - 1 - column.c + column.block + lane
+    gained = add_pairs(gained, load_pairs(columns.pairs, 0, columns.pairs.size, k), column.factors)
+    store(columns.sums, column.at + lane, add(load_part(columns.sums, column.at + lane), gained))
+    return gained
 
 
 @inline
 def _start_sums(rows: ZnccRows, y: int, x0: int, x1: int) -> None:
-    """Fill the column sums of columns x0..x1 with all rows of the window around row `y` but the last."""
+    """Fill the sums of columns x0..x1 with all rows of the window around row `y` but the last."""
     columns = rows.columns.factors.size
     for n in range(len(rows.cells.blocks)):
-        for c in range(x0, x1 + 2 * rows.half):
-            store(rows.columns.sums, (n * columns + c) * LANES, splat(np.int32(0)))
+        for c in range(x0 - 1, x1 + 2 * rows.half):  # before column x0 they are 0
+            for lane in range(0, LANES, PART):
+                store(rows.columns.sums, (n * (columns + 1) + c + 1) * LANES + lane, splat_part(np.int32(0)))
     for row in range(y, y + 2 * rows.half):
         _pair_rows(rows, x0, x1, row, -1)
         for n in range(len(rows.cells.blocks)):
+            gained = splat_parts(np.int32(0))
             for c in range(x0, x1 + 2 * rows.half):
-                _column(rows, (n * columns + c) * LANES, c, n * LANES)
+                gained = each_part(_gain, gained, 0, _column(rows, c, n * LANES))
 
 
 @by_types
@@ -385,24 +414,61 @@ def _to_costs(rho: Any, steps: Any, wide: Any) -> Any:
     magic = np.float32(1.5 * 2**23)
 
     def of_bytes(rho: Any, steps: Any, wide: Any) -> Any:
-        whole = convert(bits_of(add(rho, splat(magic))), np.int8(0))
-        return subtract(splat(np.uint8(steps)), convert(maximum(whole, splat(np.int8(0))), np.uint8(0)))
+        whole = convert(bits_of(add(rho, splat_part(magic))), np.int8(0))
+        return subtract(splat_part(np.uint8(steps)), convert(maximum(whole, splat_part(np.int8(0))), np.uint8(0)))
 
     def of_words(rho: Any, steps: Any, wide: Any) -> Any:
-        whole = convert(bits_of(add(rho, splat(magic))), np.int16(0))
-        return subtract(splat(np.uint8(steps)), convert(maximum(whole, splat(np.int16(0))), np.uint8(0)))
+        whole = convert(bits_of(add(rho, splat_part(magic))), np.int16(0))
+        return subtract(splat_part(np.uint8(steps)), convert(maximum(whole, splat_part(np.int16(0))), np.uint8(0)))
 
     return of_words if len(wide) > 0 else of_bytes
 
 
+class _Pixel(NamedTuple):
+    """A pixel and what its costs need besides the products of its windows; lanes of a vector are all the same."""
+
+    rows: ZnccRows
+    k: int  # right pixel of the first level
+    to: int  # element of the costs
+    left_sum: Any
+    left_scale: Any
+    out: NDArray[np.uint8]
+
+
 @inline
-def _cost_of(rows: ZnccRows, y: int, x: int, k: int, total: Any) -> Any:
-    """Return the costs of 64 levels of a pixel whose first right pixel is element `k`, from n times their products."""
-    left_sum = splat_at(rows.statistics.left_sum, y * rows.cells.width + x)
-    numerator = add(total, multiply_pairs(load(rows.statistics.right_sum, k), left_sum))
-    rho = multiply(convert(numerator, np.float32(0)), load(rows.statistics.right_scale, k))
-    rho = multiply(rho, splat_at(rows.statistics.left_scale, y * rows.cells.width + x))
-    return _to_costs(rho, rows.steps, rows.wide_steps)
+def _pixel(rows: ZnccRows, y: int, x: int, level: int, to: int, out: NDArray[np.uint8]) -> _Pixel:
+    k = y * rows.statistics.right_width + rows.cells.width - 1 - x + level
+    here = y * rows.cells.width + x
+    left_sum = splat_part_at(rows.statistics.left_sum, here)
+    return _Pixel(rows, k, to, left_sum, splat_part_at(rows.statistics.left_scale, here), out)
+
+
+@inline
+def _write_costs(total: Any, lane: int, pixel: _Pixel) -> None:
+    """Write the costs of a pixel, `PART` levels, from n times the products of their windows."""
+    statistics = pixel.rows.statistics
+    numerator = add_scaled(total, load_part(statistics.right_sum, pixel.k + lane), pixel.left_sum)
+    rho = multiply(convert(numerator, np.float32(0)), load_part(statistics.right_scale, pixel.k + lane))
+    costs = _to_costs(multiply(rho, pixel.left_scale), pixel.rows.steps, pixel.rows.wide_steps)
+    store(pixel.out, pixel.to + lane, costs)
+
+
+class _Window(NamedTuple):
+    """A pixel and the newest column of its windows."""
+
+    pixel: _Pixel
+    column: _Column
+
+
+@inline
+def _slide(gained: Any, lane: int, window: _Window) -> Any:
+    """Bring the newest column to this row and write the costs of the window; return what `_gain` does."""
+    rows = window.pixel.rows
+    gained = _gain(gained, lane, window.column)
+    newest = window.column.at + lane
+    before = load_part(rows.columns.sums, newest - (2 * rows.half + 1) * LANES)
+    _write_costs(subtract(load_part(rows.columns.sums, newest), before), lane, window.pixel)
+    return gained
 
 
 @implements(ZnccRows)
@@ -428,32 +494,77 @@ def _zncc_row(rows: ZnccRows, y: int, x0: int, x1: int, out: NDArray[np.uint8]) 
     state[2] = x1
     _pair_rows(rows, x0, x1, row_in, row_out)
     padded = LANES * len(cells.blocks)
-    columns = cells.width + window - 1
     for n in range(len(cells.blocks)):
         block = n * LANES
-        base = n * columns * LANES
-        # One pass: a column's sum is brought to this row, then it enters the window and the oldest leaves.
-        total = splat(np.int32(0))
+        gained = splat_parts(np.int32(0))
         for c in range(x0, x0 + window - 1):
-            total = add(total, _column(rows, base + c * LANES, c, block))
+            gained = each_part(_gain, gained, 0, _column(rows, c, block))
         for x in range(x0, x1):
-            at = base + x * LANES  # of the oldest column
-            total = add(total, _column(rows, at + (window - 1) * LANES, x + window - 1, block))
-            k = y * rows.statistics.right_width + cells.width - 1 - x + block
-            store(out, x * padded + block, _cost_of(rows, y, x, k, total))
-            total = subtract(total, load(rows.columns.sums, at))
+            pixel = _pixel(rows, y, x, block, x * padded + block, out)
+            gained = each_part(_slide, gained, 0, _Window(pixel, _column(rows, x + window - 1, block)))
     mask_row(cells, y, x0, x1, out)
 
 
+class _NarrowPair(NamedTuple):
+    """A pair of rows of a padded column, for the steps of the narrow row."""
+
+    rows: ZnccRows
+    start: int  # of the pair in `pairs`
+    k: int  # right pixel of the first level
+    factors: Any
+
+
 @inline
-def _narrow_column(rows: ZnccRows, c: int, start: int) -> Any:
-    """Return n times the products of padded column `c` of the window, for the levels from `start` on."""
-    total = splat(np.int32(0))
-    for pair in range(rows.half + 1):
-        right = load(rows.columns.pairs, pair * rows.images.right_stride + rows.images.left_stride - 1 - c + start)
-        factors = splat_at(rows.columns.factors, pair * rows.images.left_stride + c)
-        total = add(total, multiply_pairs(right, factors))
-    return total
+def _add_pair(sums: Any, lane: int, pair: _NarrowPair) -> Any:
+    """Add the products of a pair of rows to the sums of columns."""
+    pairs = load_pairs(pair.rows.columns.pairs, pair.start, pair.rows.images.right_stride, pair.k + lane)
+    return add_pairs(sums, pairs, pair.factors)
+
+
+@inline
+def _add_last_row(sums: Any, lane: int, pair: _NarrowPair) -> Any:
+    """Add the products of the last row of a window, whose pair has no second row."""
+    pairs = load_pairs(pair.rows.columns.pairs, pair.start, pair.rows.images.right_stride, pair.k + lane)
+    return add_firsts(sums, pairs, pair.factors)
+
+
+@inline
+def _narrow_pair(rows: ZnccRows, pair: int, c: int, start: int) -> _NarrowPair:
+    images = rows.images
+    factors = splat_pair_at(rows.columns.factors, pair * images.left_stride + c)
+    return _NarrowPair(rows, pair * images.right_stride, images.left_stride - 1 - c + start, factors)
+
+
+@inline
+def _add_column(rows: ZnccRows, sums: Any, c: int, start: int) -> Any:
+    """Add n times the products of padded column `c` of the window, for the levels from `start` on."""
+    for pair in range(rows.half):
+        sums = each_part(_add_pair, sums, 0, _narrow_pair(rows, pair, c, start))
+    return each_part(_add_last_row, sums, 0, _narrow_pair(rows, rows.half, c, start))
+
+
+class _Place(NamedTuple):
+    """A pixel and the place of one column's sums."""
+
+    pixel: _Pixel
+    at: int
+
+
+@inline
+def _put_sums(sums: Any, lane: int, place: _Place) -> Any:
+    """Write the sums up to a column; return them."""
+    store(place.pixel.rows.columns.sums, place.at + lane, sums)
+    return sums
+
+
+@inline
+def _narrow_slide(sums: Any, lane: int, place: _Place) -> Any:
+    """Write the costs of the window whose last column `sums` lead up to.
+
+    Those up to the column before the window are in the place where these are written.
+    """
+    _write_costs(subtract(sums, load_part(place.pixel.rows.columns.sums, place.at + lane)), lane, place.pixel)
+    return _put_sums(sums, lane, place)
 
 
 @implements(NarrowZnccRows)
@@ -465,23 +576,18 @@ def _narrow_zncc_row(narrow: NarrowZnccRows, y: int, x0: int, x1: int, out: NDAr
     n = window * window
     for pair in range(rows.half + 1):
         _write_pairs(rows, x0, x1, pair, y + 2 * pair, y + 2 * pair + 1 if pair < rows.half else -1, n, n)
-    sums = rows.columns.sums
     before = np.int64(-1)
-    total = splat(np.int32(0))
+    sums = splat_parts(np.int32(0))
     for x in range(x0, x1):
         start = np.int64(narrow.starts[y * cells.width + x])
-        if start == before:  # the window slides: its oldest column leaves, in whose place the next one is kept
-            at = (x - 1) % window * LANES
-            column = _narrow_column(rows, x + window - 1, start)
-            total = add(subtract(total, load(sums, at)), column)
-            store(sums, at, column)
-        else:
-            total = splat(np.int32(0))
-            for c in range(x, x + window):
-                column = _narrow_column(rows, c, start)
-                total = add(total, column)
-                store(sums, c % window * LANES, column)
+        newest = x + window - 1
+        pixel = _pixel(rows, y, x, start, x * LANES, out)
+        if start != before:  # nothing slides: all columns of this window come anew
+            sums = each_part(_put_sums, sums, 0, _Place(pixel, newest % window * LANES))
+            for c in range(x, newest):
+                sums = _add_column(rows, sums, c, start)
+                sums = each_part(_put_sums, sums, 0, _Place(pixel, c % window * LANES))
         before = start
-        k = y * rows.statistics.right_width + cells.width - 1 - x + start
-        store(out, x * LANES, _cost_of(rows, y, x, k, total))
+        sums = _add_column(rows, sums, newest, start)
+        sums = each_part(_narrow_slide, sums, 0, _Place(pixel, newest % window * LANES))
     mask_narrow_row(cells, narrow.starts, y, x0, x1, out)

@@ -1,11 +1,11 @@
-"""Compile the kernels of two methods for 64-bit ARM, on any machine, and count what their machine code does.
+"""Compile the kernels of some methods for 64-bit ARM, on any machine, and count what their machine code does.
 
 Two steps, each in a process of its own, since numba decides for a processor when it is imported:
 
     python cross.py record SIGNATURES           match a small pair, and keep what types the kernels were called with
     python cross.py count SIGNATURES COUNTS     compile for these types, without running anything
 
-S2 and S3 have every hot kernel between them: both costs, both aggregations, the selection.
+The methods have every hot kernel between them: both costs, both aggregations, the selection, both searches.
 """
 
 from __future__ import annotations
@@ -18,10 +18,28 @@ import re
 import sys
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
 
-TRIPLE = "aarch64-unknown-linux-gnu"
-METHODS = ("S2", "S3")
-HOT = ("first_visit", "_last_visit", "_produce_rows", "_filter_band", "_census_row", "_zncc_row", "select_row")
+
+class Processor(NamedTuple):
+    """What to compile for, and which processor of qemu runs it."""
+
+    triple: str
+    name: str  # LLVM's
+    bits: int  # of the widest vectors
+    emulated: str
+
+
+PROCESSORS = {
+    "neon": Processor("aarch64-unknown-linux-gnu", "generic", 128, "cortex-a72"),
+    "avx2": Processor("x86_64-unknown-linux-gnu", "haswell", 256, "Haswell"),
+}
+METHODS = (("S2", "full"), ("S3", "full"), ("S2", "coarse-to-fine"), ("S4", "coarse-to-fine"))
+HOT = (
+    "first_visit", "_last_visit", "_produce_rows", "_filter_band", "_census_row", "_zncc_row", "select_row",
+    "first_narrow_visit", "_last_narrow_visit", "_narrow_census_row", "_narrow_zncc_row",
+)  # fmt: skip
 """Kernels that a frame's time goes to, by the name of their function."""
 
 KINDS = {
@@ -50,8 +68,8 @@ def record(path: str) -> None:
     import stereokit
 
     image = np.random.default_rng(0).integers(0, 256, (24, 80), dtype=np.uint8)
-    for method in METHODS:
-        stereokit.Matcher(method, max_disparity=128, threads=1)(image, image)
+    for method, search in METHODS:
+        stereokit.Matcher(method, max_disparity=128, search=search, threads=1)(image, image)
     signatures = {}
     for name, module in sorted(sys.modules.items()):
         for key in HOT:
@@ -61,21 +79,34 @@ def record(path: str) -> None:
     Path(path).write_bytes(dumps(signatures))
 
 
-def count(signatures: str, out: str) -> None:
-    """Compile for ARM and write how often each kind of instruction stands in a kernel's code."""
-    os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = "generic", ""
+def pretend(processor: str) -> None:
+    """Let numba compile for a processor, and the package take it for this one; before either is imported.
+
+    Raises RuntimeError where LLVM cannot.
+    """
+    triple, name, bits, _ = PROCESSORS[processor]
+    os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = name, ""
     import llvmlite.binding as binding
     from llvmlite.binding import targets
 
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
-    binding.get_process_triple = targets.get_process_triple = lambda: TRIPLE
+    binding.get_process_triple = targets.get_process_triple = lambda: triple
+    binding.Target.from_triple(triple)
+    binding.Target.from_default_triple = classmethod(lambda cls: cls.from_triple(triple))
+    from stereokit.kernels.simd import arithmetic
+
+    arithmetic.vector_bits = lambda: bits
+    arithmetic.config = SimpleNamespace(CPU_NAME=None)  # named, it would count as one that has 128 bits
+
+
+def count(signatures: str, out: str) -> None:
+    """Compile for ARM and write how often each kind of instruction stands in a kernel's code."""
     try:
-        binding.Target.from_triple(TRIPLE)
+        pretend("neon")
     except RuntimeError as error:
         Path(out).write_text(json.dumps({"missing": str(error)}), encoding="utf-8")
         return
-    binding.Target.from_default_triple = classmethod(lambda cls: cls.from_triple(TRIPLE))
     import stereokit.matching  # noqa: F401 (its types come before the signatures)
 
     table = {}
@@ -83,7 +114,7 @@ def count(signatures: str, out: str) -> None:
         kernel = getattr(importlib.import_module(name), key)
         for number, signature in enumerate(overloads):
             kernel.compile(signature)
-            text = kernel.inspect_asm(kernel.signatures[-1])
+            text = kernel.inspect_asm(signature)
             table[f"{key}.{number}" if number else key] = counted(text)
     Path(out).write_text(json.dumps(table), encoding="utf-8")
 
@@ -94,7 +125,47 @@ def counted(text: str) -> dict[str, int]:
     counts = Counter({kind: 0 for kind in KINDS})
     for line in lines:
         counts.update(kind for kind, pattern in KINDS.items() if re.match(pattern, line))
-    return dict(counts)
+    return {**counts, "loop": largest_loop(text)}
+
+
+def largest_loop(text: str) -> int:
+    """Return the number of instructions of the largest loop that has no loop in it, each counted once."""
+    sizes, after, places = [0], [[]], {}
+    falls = [True]
+    for line in text.splitlines():
+        if label := re.match(r"(\.?\w+):", line):
+            places[label[1]] = len(sizes)
+        elif not line.startswith("\t") or line.startswith("\t."):
+            continue
+        else:
+            sizes[-1] += 1
+            branch = re.match(r"\t(b|b\.\w+|cbn?z|tbn?z|ret|br)\b(?:.*\s(\.LBB\w+))?", line)
+            if branch is None:
+                continue
+            after[-1] += [branch[2]] if branch[2] else []
+            falls[-1] = branch[1] not in ("b", "br", "ret")
+        sizes.append(0)
+        after.append([])
+        falls.append(True)
+    follow = [
+        {places[label] for label in after[n] if label in places}
+        | ({n + 1} if falls[n] and n + 1 < len(sizes) else set())
+        for n in range(len(sizes))
+    ]
+    before: list[set[int]] = [set() for _ in sizes]
+    for n, targets in enumerate(follow):
+        for target in targets:
+            before[target].add(n)
+    loops: dict[int, set[int]] = {}
+    for last, heads in enumerate(follow):
+        for head in (head for head in heads if head <= last):
+            body = loops.setdefault(head, {head})
+            waiting = {last} - body
+            while waiting:
+                body |= waiting
+                waiting = set().union(*(before[n] for n in waiting)) - body
+    inner = [body for head, body in loops.items() if not any(other in body for other in loops if other != head)]
+    return max((sum(sizes[n] for n in body) for body in inner), default=0)
 
 
 if __name__ == "__main__":

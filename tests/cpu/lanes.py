@@ -13,6 +13,7 @@ import numpy as np
 __all__ = ["Lanes", "Misaligned", "OutOfBounds"]
 
 LANES = 64
+PART = 16
 
 
 class OutOfBounds(Exception):
@@ -24,7 +25,7 @@ class Misaligned(Exception):
 
 
 class Lanes:
-    """64 values of one type."""
+    """Values of one type, 64 or the 16 of a part."""
 
     __slots__ = ("values",)
 
@@ -49,10 +50,22 @@ def load(array: np.ndarray, offset: Any) -> Lanes:
     return Lanes(_part(array, offset).copy())
 
 
+def load_part(array: np.ndarray, offset: Any) -> Lanes:
+    return Lanes(_part(array, offset, PART).copy())
+
+
 def store(array: np.ndarray, offset: Any, value: Lanes) -> None:
     if array.dtype != value.values.dtype:
         raise TypeError(f"{value.values.dtype} into {array.dtype}")
-    _part(array, offset)[:] = value.values
+    _part(array, offset, value.values.size)[:] = value.values
+
+
+def store_pair(array: np.ndarray, start: Any, count: Any, k: Any, first: Any, second: Any) -> None:
+    _part(_part(array, start, count), k, 1)[0] = (int(first) & 0xFFFF) | (int(second) << 16)
+
+
+def load_pairs(array: np.ndarray, start: Any, count: Any, k: Any) -> Lanes:
+    return load_part(_part(array, start, count), k)
 
 
 def stream(array: np.ndarray, offset: Any, value: Lanes) -> None:
@@ -77,6 +90,25 @@ def splat_at(array: np.ndarray, offset: Any) -> Lanes:
     return splat(_part(array, offset, 1)[0])
 
 
+def splat_part(scalar: Any) -> Lanes:
+    return Lanes(np.full(PART, scalar, np.asarray(scalar).dtype))
+
+
+def splat_part_at(array: np.ndarray, offset: Any) -> Lanes:
+    return splat_part(_part(array, offset, 1)[0])
+
+
+splat_pair_at = splat_part_at
+
+
+def splat_parts(scalar: Any) -> tuple[Lanes, ...]:
+    return (splat_part(scalar),) * (LANES // PART)
+
+
+def each_part(step: Any, parts: tuple[Lanes, ...], lane: int, context: Any) -> tuple[Any, ...]:
+    return tuple(step(part, lane + k * PART, context) for k, part in enumerate(parts))
+
+
 def aligned(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     raw = np.random.default_rng(size).integers(0, 256, size + 64, np.uint8)
@@ -99,8 +131,8 @@ def multiply(a: Lanes, b: Lanes) -> Lanes:
     return Lanes(a.values * b.values)
 
 
-def multiply_high(a: Lanes, b: Lanes) -> Lanes:
-    return Lanes((a.values.astype(np.int32) * b.values >> 16).astype(np.int16))
+def multiply_high_doubled(a: Lanes, b: Lanes) -> Lanes:
+    return Lanes((a.values.astype(np.int32) * b.values >> 15).astype(np.int16))
 
 
 def add_saturated(a: Lanes, b: Lanes) -> Lanes:
@@ -146,10 +178,19 @@ def bits_of(value: Lanes) -> Lanes:
     return Lanes(value.values.view(np.int32))
 
 
-def multiply_pairs(a: Lanes, b: Lanes) -> Lanes:
-    low = [v.values << 16 >> 16 for v in (a, b)]
-    high = [v.values >> 16 for v in (a, b)]
-    return Lanes(low[0] * low[1] + high[0] * high[1])
+def add_pairs(total: Lanes, pairs: Lanes, factors: Lanes) -> Lanes:
+    low = [v.values << 16 >> 16 for v in (pairs, factors)]
+    high = [v.values >> 16 for v in (pairs, factors)]
+    return Lanes(total.values + low[0] * low[1] + high[0] * high[1])
+
+
+def add_firsts(total: Lanes, pairs: Lanes, factors: Lanes) -> Lanes:
+    assert (factors.values >> 16 == 0).all()
+    return add_pairs(total, pairs, factors)
+
+
+def add_scaled(total: Lanes, a: Lanes, b: Lanes) -> Lanes:
+    return Lanes(total.values + a.values * (b.values << 16 >> 16))
 
 
 def shift_left(value: Lanes, count: Any) -> Lanes:

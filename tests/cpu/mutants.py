@@ -174,7 +174,7 @@ MUTANTS = [
     ),
     Mutant(
         "rho is rounded down", "costs.zncc",
-        "bits_of(add(rho, splat(magic)))", "convert(rho, np.int32(0))", _ROUNDING, "zncc", "of_bytes",
+        "bits_of(add(rho, splat_part(magic)))", "convert(rho, np.int32(0))", _ROUNDING, "zncc", "of_bytes",
     ),
     Mutant(
         "the padded image begins a column past the border", "costs.zncc",
@@ -182,9 +182,8 @@ MUTANTS = [
         _BOUNDS, "zncc",
     ),
     Mutant(
-        "the newest column leaves the window", "costs.zncc",
-        "subtract(total, load(rows.columns.sums, at))",
-        "subtract(total, load(rows.columns.sums, at + (window - 1) * LANES))", _RULE, "zncc",
+        "the oldest column is not in the window", "costs.zncc",
+        "newest - (2 * rows.half + 1) * LANES", "newest - 2 * rows.half * LANES", _RULE, "zncc",
     ),
     Mutant(
         "the last column that looks past the border is not masked", "costs.rows",
@@ -302,11 +301,12 @@ MUTANTS = [
     ),
     Mutant(
         "the column that leaves is the next one", "costs.zncc",
-        "at = (x - 1) % window * LANES", "at = x % window * LANES", _RULE, "narrow_zncc",
+        "each_part(_narrow_slide, sums, 0, _Place(pixel, newest % window * LANES))",
+        "each_part(_narrow_slide, sums, 0, _Place(pixel, (newest + 1) % window * LANES))", _RULE, "narrow_zncc",
     ),
     Mutant(
         "the oldest column stays in the window", "costs.zncc",
-        "add(subtract(total, load(sums, at)), column)", "add(total, column)", _RULE, "narrow_zncc",
+        "subtract(sums, load_part(place.pixel.rows.columns.sums, place.at + lane))", "sums", _RULE, "narrow_zncc",
     ),
     Mutant(
         "the last row of a window has a partner", "costs.zncc",

@@ -16,7 +16,7 @@ import pytest
 from cpu import lanes
 
 from stereokit.kernels import simd
-from stereokit.kernels.jit import kernel
+from stereokit.kernels.jit import inline, kernel
 
 INTEGERS = (np.uint8, np.int8, np.uint16, np.int16, np.int32)
 EXTREMES = (0, 1, -1, 127, 128, -128, 255, 256, 2**15 - 1, 2**15, -(2**15), 2**16 - 1, 2**31 - 1, -(2**31))
@@ -31,9 +31,11 @@ def run(request):
         function(*arguments)
 
     def interpreted(function, *arguments):
-        code = getattr(function, "py_func", function).__code__
+        names = {"np": np, "simd": lanes}
+        for step in (_add_pair, _scale, _copy_part):
+            names[step.__name__] = FunctionType(step.py_func.__code__, names)
         with np.errstate(all="ignore"):
-            FunctionType(code, {"np": np, "simd": lanes})(*arguments)
+            FunctionType(function.py_func.__code__, names)(*arguments)
 
     return compiled if request.param == "compiled" else interpreted
 
@@ -162,33 +164,76 @@ def _product_and_sum(a, b, out):
 
 @kernel
 def _high_words(a, b, out):
-    simd.store(out, 0, simd.multiply_high(simd.load(a, 0), simd.load(b, 0)))
+    simd.store(out, 0, simd.multiply_high_doubled(simd.load(a, 0), simd.load(b, 0)))
 
 
-def test_high_words_of_products_round_down(run):
+def test_high_words_of_doubled_products_round_down(run):
     a, b = integers(np.int16, 0), integers(np.int16, 1)
+    a >>= 1  # twice a must fit
     out = np.empty(COUNT, np.int16)
     run(_high_words, a, b, out)
-    np.testing.assert_array_equal(out, loop(lambda x, y: (x * y) // 2**16, a, b, dtype=np.int16))
+    np.testing.assert_array_equal(out, loop(lambda x, y: (2 * x * y) // 2**16, a, b, dtype=np.int16))
+
+
+@inline
+def _add_pair(total, lane, context):
+    pairs, start, count, factors, k = context
+    words = simd.load_pairs(pairs, start, count, 3 + lane)
+    total = simd.add_pairs(total, words, simd.splat_pair_at(factors, k))
+    return simd.add_firsts(total, words, simd.splat_pair_at(factors, k + 1))
+
+
+@inline
+def _copy_part(part, lane, out):
+    simd.store(out, lane, part)
+    return part
 
 
 @kernel
-def _pairs(a, b, out):
-    simd.store(out, 0, simd.multiply_pairs(simd.load(a, 0), simd.load(b, 0)))
+def _pairs(first, second, start, pairs, factors, k, out):
+    for n in range(first.size):
+        simd.store_pair(pairs, start, first.size, n, first[n], second[n])
+    totals = simd.splat_parts(np.int32(1))
+    totals = simd.each_part(_add_pair, totals, 0, (pairs, start, first.size, factors, k))
+    simd.each_part(_copy_part, totals, 0, out)
 
 
-def test_pairs_of_words_are_multiplied_and_added(run):
-    a, b = integers(np.int32, 0), integers(np.int32, 1)
-    low, high = 2**15 - 1, -(2**15)
-    for k, parts in enumerate([(high, high, high, high), (low, low, low, low), (high, low, 1, -1), (-1, 0, 1, high)]):
-        a[k], b[k] = (wrap((x & 0xFFFF) | (y << 16), np.int32) for x, y in (parts[:2], parts[2:]))
-
-    def rule(x, y):
-        return sum(wrap(x >> s, np.int16) * wrap(y >> s, np.int16) for s in (0, 16))
-
+@pytest.mark.parametrize("start", [0, 5])
+@pytest.mark.parametrize("factor", [(2**15 - 1, -1), (-(2**15), 0), (3, -(2**15)), (-(2**15), -(2**15)), (-7, 9)])
+def test_pairs_of_words_are_multiplied_and_added(run, start, factor):
+    first, second = (np.resize(integers(np.int16, seed), 3 + COUNT + 2) for seed in (0, 1))
+    pairs = np.full(start + first.size + 1, 77, np.int32)
+    factors = np.array([1, wrap((factor[0] & 0xFFFF) | (factor[1] << 16), np.int32), -5 & 0xFFFF], np.int32)
     out = np.empty(COUNT, np.int32)
-    run(_pairs, a, b, out)
-    np.testing.assert_array_equal(out, loop(rule, a, b, dtype=np.int32))
+    run(_pairs, first, second, start, pairs, factors, 1, out)
+    expected = loop(lambda x, y: 1 + x * (factor[0] - 5) + y * factor[1], first[3:-2], second[3:-2], dtype=np.int32)
+    np.testing.assert_array_equal(out, expected)
+    assert (pairs[:start] == 77).all() and pairs[-1] == 77
+
+
+@inline
+def _scale(total, lane, context):
+    values, factors, k = context
+    shifted = simd.add(simd.load_part(values, lane), simd.splat_part(np.int32(2)))
+    return simd.add_scaled(total, shifted, simd.splat_part_at(factors, k))
+
+
+@kernel
+def _scaled(values, factors, k, out):
+    totals = simd.each_part(_scale, simd.splat_parts(np.int32(-(2**31))), 0, (values, factors, k))
+    simd.each_part(_copy_part, totals, 0, out)
+
+
+@pytest.mark.parametrize("factor", [0, 1, -1, 2**15 - 1, -(2**15)])
+def test_words_are_scaled_and_added(run, factor):
+    values = integers(np.int16, 0).astype(np.int32) - 2
+    out = np.empty(COUNT, np.int32)
+    run(_scaled, values, np.array([5, factor & 0xFFFF], np.int32), 1, out)
+    np.testing.assert_array_equal(out, loop(lambda x: -(2**31) + (x + 2) * factor, values, dtype=np.int32))
+
+
+def test_a_block_is_made_of_whole_parts():
+    assert simd.LANES % simd.PART == 0 and lanes.LANES % lanes.PART == 0 and lanes.PART < lanes.LANES
 
 
 @kernel
@@ -350,7 +395,8 @@ def test_the_type_of_vectors():
     assert simd.Vector(types.uint8) == simd.Vector(types.uint8) != simd.Vector(types.int8)
     assert simd.Vector(types.float32).is_float and not simd.Vector(types.int32).is_float
     assert (simd.Vector(types.float32).suffix, simd.Vector(types.uint16).suffix) == ("v64f32", "v64i16")
-    assert str(simd.Vector(types.int16).llvm) == "<64 x i16>"
+    assert str(simd.Vector(types.int16).llvm) == "<64 x i16>" != str(simd.Vector(types.int16, 16).llvm)
+    assert simd.Vector(types.int16, 16) == simd.Vector(types.int16, 16) != simd.Vector(types.int16)
     assert simd.vector_bits() in (128, 256, 512)
 
 

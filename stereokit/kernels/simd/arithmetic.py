@@ -4,16 +4,31 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import config, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from stereokit.kernels.simd.shuffle import low_bytes_ir
-from stereokit.kernels.simd.types import I32, LANES, Vector, call_ir, splat_ir, vector_bits
+from stereokit.kernels.simd.types import (
+    I32,
+    LANES,
+    PAIRED,
+    Vector,
+    call_ir,
+    lanes_ir,
+    on_arm,
+    on_x86,
+    splat_ir,
+    vector_bits,
+)
 
 __all__ = [
     "add",
+    "add_firsts",
+    "add_pairs",
     "add_saturated",
+    "add_scaled",
     "bits_of",
     "bitwise_or",
     "convert",
@@ -26,8 +41,7 @@ __all__ = [
     "maximum",
     "minimum",
     "multiply",
-    "multiply_high",
-    "multiply_pairs",
+    "multiply_high_doubled",
     "select",
     "shift_left",
     "shift_right",
@@ -68,10 +82,24 @@ def _max_float(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
     return builder.select(builder.fcmp_ordered(">", x, y), x, y)
 
 
-def _high(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
-    wide = ir.VectorType(I32, LANES)
+def _high_doubled(builder: Any, kind: Vector, x: Any, y: Any) -> Any:
+    if on_arm():  # one instruction, which LLVM would not choose by itself; it saturates for -2**15 twice alone
+        eight = ir.VectorType(ir.IntType(16), 8)
+        return _by_parts(builder, lambda *v: call_ir(builder, "llvm.aarch64.neon.sqdmulh.v8i16", eight, v), 8, x, y)
+    x = builder.shl(x, ir.Constant(kind.llvm, [1] * kind.lanes))
+    wide = ir.VectorType(I32, kind.lanes)
     product = builder.mul(builder.sext(x, wide), builder.sext(y, wide))  # with the shift: one instruction on most
-    return builder.trunc(builder.lshr(product, ir.Constant(wide, [16] * LANES)), kind.llvm)
+    return builder.trunc(builder.lshr(product, ir.Constant(wide, [16] * kind.lanes)), kind.llvm)
+
+
+def _by_parts(builder: Any, build: Any, count: int, *vectors: Any) -> Any:
+    """Emit what `build` makes of each `count` lanes of the vectors, side by side again."""
+    starts = range(0, vectors[0].type.count, count)
+    parts = [build(*(lanes_ir(builder, v, v, range(at, at + count)) for v in vectors)) for at in starts]
+    while len(parts) > 1:
+        lanes = range(2 * parts[0].type.count)
+        parts = [lanes_ir(builder, parts[k], parts[k + 1], lanes) for k in range(0, len(parts), 2)]
+    return parts[0]
 
 
 add = _binary("add", "Return a + b, wrapping.", lambda b, k, x, y: b.add(x, y), lambda b, k, x, y: b.fadd(x, y))
@@ -81,7 +109,9 @@ subtract = _binary(
 multiply = _binary(
     "multiply", "Return a * b, wrapping.", lambda b, k, x, y: b.mul(x, y), lambda b, k, x, y: b.fmul(x, y)
 )
-multiply_high = _binary("multiply_high", "Return (a * b) >> 16 of int16 lanes, rounded down.", _high)
+multiply_high_doubled = _binary(
+    "multiply_high_doubled", "Return (2 * a * b) >> 16 of int16 lanes, rounded down; 2 * a must fit.", _high_doubled
+)
 add_saturated = _binary(
     "add_saturated", "Return a + b, clamped to the type's largest value.", _llvm("uadd.sat", "sadd.sat")
 )
@@ -133,12 +163,12 @@ def convert(typing: Any, value: Any, like: Any) -> Any:
 
     Integers wrap or widen, floats are cut towards zero: they must lie within the integer's range.
     """
-    target = Vector(like)
+    target = Vector(like, value.lanes)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         source = args[0]
         if value.is_float and not target.is_float:
-            wide = builder.fptosi(source, ir.VectorType(I32, LANES))
+            wide = builder.fptosi(source, ir.VectorType(I32, value.lanes))
             return wide if target.scalar.bitwidth == 32 else builder.trunc(wide, target.llvm)
         if target.is_float and not value.is_float:
             return (builder.sitofp if value.scalar.signed else builder.uitofp)(source, target.llvm)
@@ -156,7 +186,7 @@ def convert(typing: Any, value: Any, like: Any) -> Any:
 @intrinsic
 def bits_of(typing: Any, value: Any) -> Any:
     """Return the bits of ``float32`` lanes as ``int32``."""
-    result = Vector(types.int32)
+    result = Vector(types.int32, value.lanes)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.bitcast(args[0], result.llvm)
@@ -164,43 +194,78 @@ def bits_of(typing: Any, value: Any) -> Any:
     return result(value), generate
 
 
+def _frozen(builder: Any, x: Any) -> Any:
+    """Emit `x` itself, but as a whole: LLVM puts no other sum in its place, such as one that it must negate first."""
+    frozen = ir.Instruction(builder.block, x.type, "freeze", [x])
+    builder._insert(frozen)
+    return frozen
+
+
+def _pairs_on_x86(builder: Any, x: Any, y: Any) -> Any:
+    """Emit the one instruction for products of pairs and their sum, which LLVM would not choose by itself."""
+    bits = vector_bits() if config.CPU_NAME is None else 128  # every x86_64 has 128
+    name = {512: "llvm.x86.avx512.pmaddw.d.512", 256: "llvm.x86.avx2.pmadd.wd", 128: "llvm.x86.sse2.pmadd.wd"}[bits]
+    words = ir.VectorType(ir.IntType(16), bits // 16)
+
+    def pairs(*parts: Any) -> Any:
+        return call_ir(builder, name, ir.VectorType(I32, bits // 32), [builder.bitcast(part, words) for part in parts])
+
+    return _by_parts(builder, pairs, bits // 32, x, y)
+
+
+def _add_products(name: str, doc: str, of: slice) -> Any:
+    def define(typing: Any, total: Any, pairs: Any, factors: Any) -> Any:
+        if total.scalar != types.int32 or factors != pairs:
+            return None
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            total, pairs, factors = args
+            if PAIRED:
+                return builder.add(total, _pairs_on_x86(builder, pairs, factors))
+            # One instruction multiplies words and adds the products, each of the pair's own.
+            words = [cgutils.unpack_tuple(builder, parts)[of] for parts in (pairs, factors)]
+            for pair in zip(*words, strict=True):
+                total = builder.add(total, builder.mul(*(builder.sext(word, total.type) for word in pair)))
+            return total
+
+        return total(total, pairs, factors), generate
+
+    define.__name__ = name
+    define.__doc__ = doc
+    return intrinsic(define)
+
+
+add_pairs = _add_products(
+    "add_pairs",
+    """Return `total`, ``int32``, with both products of each pair of ``int16`` added, wrapping.
+
+    `pairs` come from `load_pairs`, `factors` from `splat_pair_at`.
+    """,
+    slice(2),
+)
+add_firsts = _add_products(
+    "add_firsts", "Return what `add_pairs` does where the second of the `factors` is 0: fewer products.", slice(1)
+)
+
+
 @intrinsic
-def multiply_pairs(typing: Any, a: Any, b: Any) -> Any:
-    """Return ``low(a) * low(b) + high(a) * high(b)`` of ``int32`` lanes that hold two ``int16`` each, wrapping.
+def add_scaled(typing: Any, total: Any, a: Any, b: Any) -> Any:
+    """Return ``total + a * low(b)`` of ``int32`` lanes.
 
-    Processors of x86 have one instruction for it, which LLVM would not choose by itself; others get the plain form.
+    The values of `a` fit ``int16``; the lanes of `b`, all the same, hold one in their low half and 0 in the high one.
     """
-    if a != Vector(types.int32) or b != a:
+    if total.scalar != types.int32 or a != total or b != total:
         return None
-    kind = a.llvm
-
-    def plain(builder: Any, x: Any, y: Any) -> Any:
-        half = ir.Constant(kind, [16] * LANES)
-        low = [builder.ashr(builder.shl(v, half), half) for v in (x, y)]
-        high = [builder.ashr(v, half) for v in (x, y)]
-        return builder.add(builder.mul(*low), builder.mul(*high))
-
-    def by_parts(builder: Any, name: str, count: int, x: Any, y: Any) -> Any:
-        def part(v: Any, at: int) -> Any:
-            lanes = ir.Constant(ir.VectorType(I32, count), list(range(at, at + count)))
-            return builder.bitcast(builder.shuffle_vector(v, v, lanes), ir.VectorType(ir.IntType(16), 2 * count))
-
-        starts = range(0, LANES, count)
-        parts = [call_ir(builder, name, ir.VectorType(I32, count), [part(x, at), part(y, at)]) for at in starts]
-        while len(parts) > 1:
-            size = 2 * parts[0].type.count
-            lanes = ir.Constant(ir.VectorType(I32, size), list(range(size)))
-            parts = [builder.shuffle_vector(parts[k], parts[k + 1], lanes) for k in range(0, len(parts), 2)]
-        return parts[0]
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        if not binding.get_process_triple().startswith("x86_64"):
-            return plain(builder, *args)
-        bits = vector_bits() if config.CPU_NAME is None else 128  # every x86_64 has 128
-        name = {512: "llvm.x86.avx512.pmaddw.d.512", 256: "llvm.x86.avx2.pmadd.wd", 128: "llvm.x86.sse2.pmadd.wd"}[bits]
-        return by_parts(builder, name, bits // 32, *args)
+        total, a, b = args
+        if on_x86():  # what goes into the sum of pairs is quicker than a product of 32 bits
+            return builder.add(total, _pairs_on_x86(builder, a, b))
+        half = ir.Constant(a.type, [16] * a.type.count)
+        product = builder.mul(a, builder.ashr(builder.shl(b, half), half))
+        return builder.add(_frozen(builder, total), product)
 
-    return a(a, b), generate
+    return total(total, a, b), generate
 
 
 def _shift(name: str, doc: str, build: Any) -> Any:
@@ -238,8 +303,21 @@ def select(typing: Any, condition: Any, a: Any, b: Any) -> Any:
 def mask_equal(typing: Any, a: Any, b: Any) -> Any:
     """Return a ``uint64`` whose bit d tells whether lane d of a and b are equal."""
 
+    def on_neon(builder: Any, equal: Any) -> Any:
+        # LLVM would bring each eight lanes to a general register and join the bytes there.
+        byte, half = ir.IntType(8), ir.VectorType(ir.IntType(8), 16)
+        bits = ir.Constant(ir.VectorType(byte, LANES), [1 << d % 8 for d in range(LANES)])
+        marks = builder.and_(builder.sext(equal, bits.type), bits)
+        parts = [lanes_ir(builder, marks, marks, range(at, at + 16)) for at in range(0, LANES, 16)]
+        while parts[0].type == half and len(parts) > 1:
+            pairs = zip(parts[::2], parts[1::2], strict=True)
+            parts = [call_ir(builder, "llvm.aarch64.neon.addp.v16i8", half, list(pair)) for pair in pairs]
+        mask = call_ir(builder, "llvm.aarch64.neon.addp.v16i8", half, [parts[0], parts[0]])
+        return builder.extract_element(builder.bitcast(mask, ir.VectorType(ir.IntType(64), 2)), ir.Constant(I32, 0))
+
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(builder.icmp_unsigned("==", *args), ir.IntType(64))
+        equal = builder.icmp_unsigned("==", *args)
+        return on_neon(builder, equal) if on_arm() else builder.bitcast(equal, ir.IntType(64))
 
     return types.uint64(a, b), generate
 

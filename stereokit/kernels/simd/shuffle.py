@@ -21,13 +21,14 @@ def low_bytes_ir(builder: Any, value: Any) -> Any:
         return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(I32, len(lanes)), list(lanes)))
 
     def halves(parts: list[Any], bits: int) -> list[Any]:
-        kind = ir.VectorType(ir.IntType(bits), LANES * 8 // bits)
+        kind = ir.VectorType(ir.IntType(bits), value.type.count * 8 // bits)
         odd = 0 if sys.byteorder == "little" else 1
         lanes = range(odd, 2 * kind.count, 2)
         parts = [builder.bitcast(part, kind) for part in parts]
         return [shuffle(parts[k], parts[k + 1], lanes) for k in range(0, len(parts), 2)]
 
-    quarters = [shuffle(value, value, range(at, at + LANES // 4)) for at in range(0, LANES, LANES // 4)]
+    quarter = value.type.count // 4
+    quarters = [shuffle(value, value, range(at, at + quarter)) for at in range(0, value.type.count, quarter)]
     return halves(halves(quarters, 16), 8)[0]
 
 

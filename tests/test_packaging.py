@@ -67,7 +67,7 @@ def test_weights_that_are_not_for_commercial_use_are_a_distribution_of_their_own
     description = metadata("stereokit-kitti-weights")
     assert description["License-Expression"] == "CC-BY-NC-SA-3.0"
     assert "CC BY-NC-SA 3.0" in (ROOT / "refiners/kitti/LICENSE").read_text(encoding="utf-8")
-    assert {path.stem for path in Path(folder).glob("*.safetensors")} == {"cnn", "pyramid", "stereovae"}
+    assert {path.stem for path in Path(folder).glob("*.safetensors")} == {"cnn", "evidence", "pyramid", "stereovae"}
 
 
 def test_the_main_distribution_holds_no_weights_trained_on_kitti():

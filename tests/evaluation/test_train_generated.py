@@ -15,6 +15,7 @@ import numpy as np  # noqa: E402
 from stereokit.cli.app import app  # noqa: E402
 from stereokit.io import write_image  # noqa: E402
 from stereokit_evaluation.synthetic import generated as synthetic  # noqa: E402
+from stereokit_evaluation.training import general  # noqa: E402
 from stereokit_evaluation.training import generated as training  # noqa: E402
 from stereokit_evaluation.training.pairs import FIRST_SEED  # noqa: E402
 from stereokit_refiners.training import evidence  # noqa: E402
@@ -67,7 +68,7 @@ def test_half_size_refiners_train_on_all_matchers_maps(tmp_path, rendered):
 
 def test_the_general_refiner_is_trained_and_goes_on_where_it_was_stopped(tmp_path, rendered, monkeypatch):
     monkeypatch.setattr(torch, "compile", lambda function: function)
-    monkeypatch.setattr(training, "_SAMPLES", 1)
+    monkeypatch.setattr(general, "_SAMPLES", 1)
     out = tmp_path / "out"
     words = ["-o", out, "--refiner", "stereokit", "--generated", 2, *SMALL, "--json", "-"]
     real, calls = evidence.make_sample, []
@@ -93,10 +94,10 @@ def test_the_general_refiner_is_trained_and_goes_on_where_it_was_stopped(tmp_pat
 def test_other_pairs_of_the_cache_are_left_out(tmp_path, rendered):
     folder = tmp_path / "pairs"
     list(training.generated_pairs(3, folder))
-    exact, samples = training._exactly(folder, 2, tmp_path)
+    exact, samples = general._exactly(folder, 2, tmp_path)
     assert sorted(path.name.split("-")[1] for path in exact.iterdir()) == [str(FIRST_SEED), str(FIRST_SEED + 1)]
-    assert training._exactly(folder, 2, tmp_path) == (exact, samples)
-    assert training._exactly(folder, 3, tmp_path)[0] != exact
+    assert general._exactly(folder, 2, tmp_path) == (exact, samples)
+    assert general._exactly(folder, 3, tmp_path)[0] != exact
 
 
 @pytest.fixture
@@ -113,7 +114,7 @@ def assets(tmp_path):
 @pytest.mark.parametrize("refiner", ["cnn", "stereokit"])
 def test_assets_are_shown_and_noted(tmp_path, assets, rendered, monkeypatch, refiner):
     monkeypatch.setattr(torch, "compile", lambda function: function)
-    monkeypatch.setattr(training, "_SAMPLES", 1)
+    monkeypatch.setattr(general, "_SAMPLES", 1)
     out, cache = tmp_path / "out", tmp_path / "cache"
     words = ["--refiner", refiner, "--generated", 2, "--cache", cache, *SMALL, "--json"]
     assert run("-o", tmp_path / "plain", *words, "-").exit_code == 0
@@ -143,10 +144,10 @@ def test_levels_hold_the_largest_disparity(farthest, levels):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["--refiner", "stereokit"], ["generated must be at least 1", "got 0"]),
-        (["--refiner", "stereokit", "--generated", 2, "--streets", 3], ["generated pairs alone", "streets"]),
-        (["--refiner", "general", "--generated", 2, "--dataset", "scenes"], ["generated pairs alone", "dataset"]),
-        (["--refiner", "stereokit", "--generated", 2, "--set", "loss=d1"], ["no setting named 'loss'", "steps"]),
+        (["--refiner", "stereokit"], ["dataset, extra, streets or generated"]),
+        (["--refiner", "general", "--generated", 2, "--streets", 3], ["streets must be 0", "'general'", "got 3"]),
+        (["--refiner", "stereokit", "--generated", 2, "--set", "decay=0"], ["no setting named 'decay'", "steps"]),
+        (["--refiner", "stereokit", "--generated", 2, "--set", "loss=l1"], ["one of general, d1", "got 'l1'"]),
         (["--refiner", "stereokit", "--generated", 2, "--set", "rows=40"], ["rows must be a multiple of 32", "40"]),
         (["--refiner", "stereokit", "--generated", 2, "--set", "steps=0"], ["steps must be at least 1", "0"]),
         (["--refiner", "cnn", "--streets", 2, "--assets", "."], ["assets must come with generated pairs", "'.'"]),

@@ -38,19 +38,24 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_refiners_that_come_without_weights_get_them_and_no_others():
+def test_refiners_that_come_without_weights_get_them_and_else_the_general_one():
     assert weights_option("cnn", "kitti") == weights_option("pyramid", "kitti") == {"weights": "kitti"}
-    for refiner in (None, "linear", "stereokit", "general", "mine.safetensors"):
+    assert weights_option("stereokit", "kitti") == weights_option("general", "kitti") == {"weights": "kitti"}
+    assert weights_option("stereokit", "kitti", ["stereokit", "linear"]) == {"weights": "kitti"}
+    assert weights_option("stereokit", "kitti", ["stereokit", "cnn"]) == {}
+    assert weights_option("cnn", "kitti", ["stereokit", "cnn"]) == {"weights": "kitti"}
+    for refiner in (None, "linear", "auto", "mine.safetensors"):
         assert weights_option(refiner, "kitti") == {}
     assert weights_option("cnn", None) == {}
     check_weights(["linear", "cnn"], "kitti")
+    check_weights(["linear", "stereokit"], "kitti")
     check_weights([], None)
     with pytest.raises(
-        OptionError, match=r"^weights must come with a refiner that needs some, got 'kitti' with .* none$"
+        OptionError, match=r"^weights must come with a refiner that takes some, got 'kitti' with .* none$"
     ):
         check_weights([], "kitti")
-    with pytest.raises(OptionError, match=r"with refiner linear, stereokit$"):
-        check_weights(["linear", "stereokit"], "kitti")
+    with pytest.raises(OptionError, match=r"with refiner linear, auto$"):
+        check_weights(["linear", "auto"], "kitti")
 
 
 def test_match_takes_them_and_says_what_is_missing_without(folder):

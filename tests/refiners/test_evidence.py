@@ -10,7 +10,8 @@ import pytest
 from refining import tuned_to_kitti
 
 import stereokit
-from stereokit.errors import OptionError
+from stereokit.errors import FileError, OptionError
+from stereokit_refiners import weights
 from stereokit_refiners.learned import EvidenceRefiner
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, STEPS, Evidence
 from stereokit_refiners.networks.layers import shapes
@@ -424,3 +425,40 @@ def test_shipped_weights_follow_an_offset_of_all_disparities():
     medians = [float(np.median((fields - truth)[:, 40:])) for fields in (near, plain)]
     assert medians[0] == pytest.approx(medians[1], abs=0.02)
     assert np.abs(near - plain)[:, 64:].mean() < 0.05
+
+
+@pytest.mark.parametrize("backend", ["openvino", "onnxruntime", "opencv"])
+def test_weights_tuned_to_kitti_run_alike_everywhere(backend):
+    tuned_to_kitti("evidence")
+    for name in {backend, "torch"} - {"opencv"}:
+        pytest.importorskip(name)
+    disparity, candidates, confidence, left, right = _case(2, seed=5, rows=61, columns=75)
+    coarse = stereokit.Disparity(disparity, np.ones(disparity.shape, bool), confidence, candidates=candidates)
+    maps = [
+        EvidenceRefiner(weights="kitti", backend=name, precision="fp32")(coarse, left, right=right).disparity
+        for name in ("torch", backend)
+    ]
+    np.testing.assert_allclose(*maps, atol=2e-3)
+    assert np.abs(maps[0] - EvidenceRefiner(precision="fp32")(coarse, left, right=right).disparity).max() > 0.1
+
+
+@pytest.mark.parametrize("scale", [1, 0.5, 0.25])
+def test_weights_tuned_to_kitti_serve_all_scales(scale):
+    tuned_to_kitti("evidence")
+    left, right, truth = _scene()
+    options = {"max_disparity": 32, "scale": scale, "device": "cpu"}
+    maps = [
+        stereokit.match(left, right, "S2", **options, refiner=refiner, **tuned)
+        for refiner, tuned in (("linear", {}), ("stereokit", {"weights": "kitti"}))
+    ]
+    wrong = [float((np.abs(fields - truth)[:, 20:] > 3).mean()) for fields in maps]
+    assert wrong[1] <= wrong[0] + 0.005
+
+
+def test_weights_tuned_to_kitti_are_not_there_without_their_package(monkeypatch):
+    monkeypatch.setattr(weights, "entry_points", lambda group: ())
+    image = np.zeros((32, 48), np.uint8)
+    with pytest.raises(
+        FileError, match=r"^weights 'kitti' are a package of their own, .* pip install \./refiners/kitti"
+    ):
+        stereokit.match(image, image, "S2", scale=0.5, refiner="stereokit", weights="kitti")

@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
+from stereokit.errors import OptionError  # noqa: E402
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS  # noqa: E402
 from stereokit_refiners.runtimes.evidence import hypotheses, network_input  # noqa: E402
 from stereokit_refiners.runtimes.mixture import mixture as compiled_mixture  # noqa: E402
@@ -99,6 +100,51 @@ def test_the_identity_costs_what_the_coarse_map_costs_and_harm_costs_more():
     worse, same = training.loss(head, fields, torch.ones(1))
     assert float(same) == float(before)
     assert float(worse) > float(value)
+
+
+@pytest.mark.parametrize(
+    ("objective", "error", "value"),
+    [("general", 1, 1 / 1.6 + 0.7 / 8 + 0.08), ("d1", 1, 3 / (1 + np.exp(4)) + 0.25), ("d1", 3, 1.5 + 0.75),
+     ("d1", 50, 3 + 5)],
+)  # fmt: skip
+def test_what_an_error_counts(objective, error, value):
+    assert float(training._badness(torch.tensor([float(error)]), objective)) == pytest.approx(value, rel=1e-5)
+
+
+def test_a_growing_folder_is_drawn_by_how_much_is_wrong_and_files_alike(tmp_path):
+    names = ["a_00_S2_000.npy", "b_00_S2_120.npy", "c_00_S2_300.npy"]
+    for name in names:
+        (tmp_path / name).touch()
+    paths, shares = training.Source(tmp_path).listed()
+    assert [path.name for path in paths] == names
+    np.testing.assert_allclose(shares, [1, 1.5, 1.5])
+    assert training.Source(paths).listed()[0] == paths
+    np.testing.assert_allclose(training.Source(paths).listed()[1], [1, 2, 3])
+
+
+def _marked(path, value, size=(16, 24)):
+    fields = {name: np.zeros((channels, *size), dtype) for name, (channels, dtype) in training._FIELDS.items()}
+    fields["kind"] += value
+    np.save(path, training.packed(fields))
+    return path
+
+
+def test_steps_are_of_one_source_each_in_their_shares(tmp_path):
+    sources = [
+        training.Source([_marked(tmp_path / "a.npy", 1)], 0.75),
+        training.Source([_marked(tmp_path / "b.npy", 2), _marked(tmp_path / "c.npy", 2)], 0.25),
+    ]
+    batches = training._batches(sources, 3, (8, 8), np.random.default_rng(0))
+    kinds = [next(batches)["kind"] for _ in range(200)]
+    assert all((kind == kind[0, 0, 0, 0]).all() for kind in kinds)
+    assert 125 < sum(int(kind[0, 0, 0, 0]) == 1 for kind in kinds) < 175
+
+
+def test_crops_larger_than_all_samples_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "_MOST_SMALL", 5)
+    source = training.Source([_marked(tmp_path / "a.npy", 1)])
+    with pytest.raises(OptionError, match="crops must fit into the samples, got 96x32 pixels"):
+        next(training._batches([source], 1, (24, 8), np.random.default_rng(0)))
 
 
 def test_a_short_run_learns_goes_on_and_gives_weights_that_are_read(tmp_path, monkeypatch, capsys):

@@ -135,29 +135,30 @@ def test_heads_are_off_by_what_rounding_to_the_steps_allows(name, which):
 
 @pytest.fixture(scope="module")
 def street():
-    """Return a pair, its exact disparity where there is one, and the half-size map."""
+    """Return both views, the half-size map, and the exact disparity where there is one."""
     pytest.importorskip("skimage")
     from stereokit_evaluation.synthetic.scenes import generate
 
     scene = generate(seed=3, width=414, height=126, max_disparity=64)
     keeping = Keeping()
     stereokit.Matcher("S2", max_disparity=64, scale=0.5, refiner=keeping, threads=1)(scene.left, scene.right)
-    return keeping.left, keeping.coarse, scene.occ
+    return keeping.left, keeping.right, keeping.coarse, scene.occ
 
 
 class Keeping:
     """A refiner that keeps what it is given."""
 
     needs_candidates = True
+    needs_right = True
 
-    def __call__(self, coarse, left, *, threads=1):
-        self.coarse, self.left = coarse, left
+    def __call__(self, coarse, left, *, right, threads=1):
+        self.coarse, self.left, self.right = coarse, left, right
         return stereokit.Disparity(np.zeros(left.shape, np.float32), np.ones(left.shape, bool))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_weights_tuned_to_kitti_are_as_good_in_8_bits_on_a_street_whose_truth_is_known(name, street):
-    left, coarse, truth = street
+    left, _, coarse, truth = street
     known = np.isfinite(truth)
     off = {}
     for precision in ("fp32", "int8"):
@@ -165,6 +166,17 @@ def test_weights_tuned_to_kitti_are_as_good_in_8_bits_on_a_street_whose_truth_is
         off[precision] = np.abs(refiner(coarse, left).disparity - truth)[known]
     assert off["int8"].mean() < off["fp32"].mean() + 0.15
     assert (off["int8"] > 3).mean() < (off["fp32"] > 3).mean() + 0.01
+
+
+def test_the_general_refiner_tuned_to_kitti_is_as_good_in_8_bits(street):
+    left, right, coarse, truth = street
+    known = np.isfinite(truth)
+    off = {}
+    for precision in ("fp32", "int8"):
+        refiner = LearnedRefiner.of(tuned_to_kitti("evidence"), backend="openvino", precision=precision)
+        off[precision] = np.abs(refiner(coarse, left, right=right).disparity - truth)[known]
+    assert off["int8"].mean() < 1.02 * off["fp32"].mean() + 0.01
+    assert (off["int8"] > 3).mean() < 1.02 * (off["fp32"] > 3).mean() + 0.001
 
 
 @pytest.mark.skipif(os.environ.get("ONEDNN_MAX_CPU_ISA") == AVX2, reason="this is the process that is held to AVX2")

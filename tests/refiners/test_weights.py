@@ -237,9 +237,9 @@ def test_networks_that_come_without_weights_say_where_there_are_some(name):
 def test_collections_are_found_by_name(tmp_path, monkeypatch):
     content = tuned_to_kitti("cnn")
     assert content.fingerprint == read(collection_file("kitti", "cnn")).fingerprint
-    with pytest.raises(FileError, match=r"^weights 'kitti' are of cnn, pyramid, stereovae, got refiner 'evidence'$"):
-        find("evidence", "kitti")
-    with pytest.raises(FileError, match=r"^weights 'kitti' are of cnn, pyramid, stereovae, got refiner 'file'$"):
+    with pytest.raises(
+        FileError, match=r"^weights 'kitti' are of cnn, evidence, pyramid, stereovae, got refiner 'file'$"
+    ):
         find("", "kitti")
     with pytest.raises(FileError, match=r"^no weights named 'kity'; did you mean 'kitti'\?"):
         find("cnn", "kity")
@@ -249,17 +249,31 @@ def test_collections_are_found_by_name(tmp_path, monkeypatch):
         find("stereovae", "kitti")
 
 
-def test_a_collection_that_is_not_installed_says_how_to_install_it_and_under_which_terms(monkeypatch):
+def test_a_collection_says_of_which_networks_it_is(tmp_path, monkeypatch):
+    tuned_to_kitti("cnn")
+    for name in ("cnn", "pyramid"):
+        write(tmp_path / f"{name}.safetensors", random_content(name))
+    monkeypatch.setattr(weights, "files", lambda package: tmp_path)
+    assert find("pyramid", "kitti").network == "pyramid"
+    with pytest.raises(FileError, match=r"^weights 'kitti' are of cnn, pyramid, got refiner 'evidence'$"):
+        find("evidence", "kitti")
+
+
+@pytest.mark.parametrize("name", ["cnn", "evidence"])
+def test_a_collection_that_is_not_installed_says_how_to_install_it_and_under_which_terms(name, monkeypatch):
     monkeypatch.setattr(weights, "entry_points", lambda group: ())
     with pytest.raises(FileError) as caught:
-        find("cnn", "kitti")
+        find(name, "kitti")
     line = one_line(caught.value)
     assert "CC BY-NC-SA 3.0" in line and "pip install ./refiners/kitti" in line
 
 
-@pytest.mark.parametrize("name", ["evidence", *NAMES])
-def test_weights_that_are_published(name):
-    content = shipped(name) if name == "evidence" else tuned_to_kitti(name)
+@pytest.mark.parametrize(
+    ("name", "tuned"), [("evidence", False), ("evidence", True), *((name, True) for name in NAMES)]
+)
+def test_weights_that_are_published(name, tuned):
+    content = tuned_to_kitti(name) if tuned else shipped(name)
+    assert tuned == any("kitti" in frame for frame in content.notes.get("frames", ()))
     assert content.network == name
     assert content.ranges, "int8 needs them"
     assert content.notes

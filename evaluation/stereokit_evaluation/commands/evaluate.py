@@ -121,7 +121,7 @@ def evaluate(
     options: dict[str, Any] = {"max_disparity": levels, **stage_options}
     check_weights(refiner or (), weights)
     runs = [
-        _matcher_run(name, scale, refine, device, options | weights_option(refine, weights), color)
+        _matcher_run(name, scale, refine, device, options | weights_option(refine, weights, refiner or ()), color)
         for name in ours
         for refine in (dict.fromkeys(refiner) if refiner else (None,))
     ]

@@ -112,7 +112,7 @@ def view(
     refiners: list[str | None] = [*refiner] if refiner else [None]
     matchers = {
         f"{name} {title(refiner_name or 'linear') if scale != 1 else ''}".strip(): Matcher(
-            name, refiner=refiner_name, **options, **weights_option(refiner_name, weights)
+            name, refiner=refiner_name, **options, **weights_option(refiner_name, weights, refiner or ())
         )
         for name in names
         for refiner_name in refiners

@@ -1,4 +1,4 @@
-"""Which refiners of a command get its ``--weights``."""
+"""Which refiners of a command get its ``--weights``: those that come without; if there are none, the general one."""
 
 from __future__ import annotations
 
@@ -16,13 +16,20 @@ def needs_weights(refiner: str) -> bool:
     return bool(getattr(find_refiner(refiner)[1], "needs_weights", False))
 
 
-def weights_option(refiner: str | None, weights: str | None) -> dict[str, Any]:
-    """Return `weights` as an option of `stereokit.Matcher`, if the refiner comes without; else nothing."""
-    return {} if weights is None or refiner is None or not needs_weights(refiner) else {"weights": weights}
+def _receivers(refiners: Sequence[str]) -> set[str]:
+    needing = {name for name in refiners if needs_weights(name)}
+    return needing or {name for name in refiners if "weights" in find_refiner(name)[2]}
+
+
+def weights_option(refiner: str | None, weights: str | None, refiners: Sequence[str] = ()) -> dict[str, Any]:
+    """Return `weights` as an option of `stereokit.Matcher`, if `refiner` gets it beside the other `refiners`."""
+    if weights is None or refiner is None or refiner not in _receivers([refiner, *refiners]):
+        return {}
+    return {"weights": weights}
 
 
 def check_weights(refiners: Sequence[str], weights: str | None) -> None:
     """Raise OptionError if weights are given for refiners of which none takes them."""
-    if weights is not None and not any(needs_weights(name) for name in refiners):
+    if weights is not None and not _receivers(refiners):
         names = ", ".join(refiners) or "none"
-        raise OptionError(f"weights must come with a refiner that needs some, got {weights!r} with refiner {names}")
+        raise OptionError(f"weights must come with a refiner that takes some, got {weights!r} with refiner {names}")

@@ -24,7 +24,8 @@ from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data.datasets import load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.synthetic.assets import check_assets
-from stereokit_evaluation.training.generated import GENERAL, generated_pairs, levels_for, stored_assets, train_general
+from stereokit_evaluation.training.general import GENERAL, RealFrames, train_general
+from stereokit_evaluation.training.generated import generated_pairs, levels_for, stored_assets
 from stereokit_evaluation.training.pairs import FIRST_SEED, pair_of, scene_pair
 
 __all__ = ["run_training"]
@@ -46,7 +47,7 @@ def run_training(
     output : Path
         Folder of the result; created if missing.
     refiner : str
-        Architecture, one of `stereokit_refiners.weights.NETWORKS`, or ``"stereokit"``.
+        Architecture, one of `stereokit_refiners.weights.NETWORKS`, or ``"stereokit"``, the general refiner.
     dataset, root : str, Path, optional
         A data set and its folder.
     frames, validation, folds : str, optional
@@ -56,10 +57,9 @@ def run_training(
     streets : int
         Synthetic streets to train on; `street_share` of the crops.
     generated : int
-        Generated pairs of all kinds to train on, as streets are; the general refiner (``"stereokit"``) trains on these
-        alone.
+        Generated pairs of all kinds to train on, as streets are.
     method : sequence of str
-        Matchers whose maps are trained on.
+        Matchers whose maps are trained on; the general refiner draws those of generated pairs itself.
     variants : int
         Variants of each frame and matcher.
     start : Path, optional
@@ -84,26 +84,21 @@ def run_training(
         If an option breaks its rule, frames have no ground truth, files cannot be used, or torch is not installed.
     """
     torch = _torch()
+    general = refiner in GENERAL
     check_integer("generated", generated, 0)
+    if general and streets:
+        raise OptionError(f"streets must be 0 for refiner {refiner!r}, whose generated pairs hold some, got {streets}")
     if assets is not None:
         check_assets(assets)
         if generated < 1:
             raise OptionError(f"assets must come with generated pairs, got {str(assets)!r} and none of them")
-    if refiner in GENERAL:
-        others: dict[str, Any] = {"dataset": dataset, "streets": streets, "extra": extra, "folds": folds}
-        others |= {"frames": frames, "validation": validation}
-        for name in (name for name, value in others.items() if value):
-            raise OptionError(f"refiner {refiner!r} trains on generated pairs alone, got {name} too")
-        if generated < 1:
-            raise OptionError(f"generated must be at least 1 for refiner {refiner!r}, got {generated}")
-        return train_general(output, generated, start=start, settings=settings, cache=cache, assets=assets)
     from stereokit_refiners.networks.layers import output_rule
     from stereokit_refiners.training.loop import Source
     from stereokit_refiners.training.samples import SampleFiles, store_variant
     from stereokit_refiners.weights import NETWORKS, read
 
-    training_settings = _training_settings(preset, settings)
-    if refiner not in NETWORKS:
+    training_settings: Any = None if general else _training_settings(preset, settings)
+    if not general and refiner not in NETWORKS:
         raise OptionError(f"refiner to train must be one of {', '.join(NETWORKS)}, got {refiner!r}")
     if dataset is None and streets < 1 and generated < 1 and not extra:
         raise OptionError("dataset, extra, streets or generated must be set, got none of them")
@@ -115,13 +110,14 @@ def run_training(
             f"at least 1, got {street_share:g}, {extra_share:g}, {streets} and {variants}"
         )
     content = None if start is None else read(start)
-    if content is not None and content.network != refiner:
+    if content is not None and not general and content.network != refiner:
         raise OptionError(f"start must hold weights of {refiner!r}, got those of {content.network!r}")
     methods = list(method)
     for name in methods:
         parse_method(name)
     check_levels(0, max_disparity)
-    output_rule(NETWORKS[refiner], training_settings.output_mode)
+    if not general:
+        output_rule(NETWORKS[refiner], training_settings.output_mode)
     all_frames = [] if dataset is None else list(load_frames(dataset, root))
     groups = _groups(all_frames, frames, validation, folds)
     extra_frames = _extra(extra)
@@ -133,6 +129,13 @@ def run_training(
     for frame in (*extra_frames.values(), *(f for pair in groups for part in pair for f in part)):
         if frame.noc is None and frame.occ is None:
             raise InputError(f"frame {frame.name} has no ground truth to train on")
+    if general:
+        real = RealFrames(
+            groups, dataset, extra_frames, methods, variants, max_disparity, extra_share, street_share,
+            folds=folds is not None,
+        )  # fmt: skip
+        document = train_general(output, generated, real, start=start, settings=settings, cache=cache, assets=assets)
+        return document | {"streets": 0, "pooled": _pooled(document["results"], methods)}
     if cache is not None:
         make_folder("cache", cache)
     make_folder("output", output)

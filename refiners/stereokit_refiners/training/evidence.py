@@ -14,7 +14,8 @@ import argparse
 import os
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import stereokit
+from stereokit.errors import OptionError
 from stereokit.result import Disparity
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, STEPS, WINDOWS, Evidence
 from stereokit_refiners.runtimes.evidence import hypotheses, network_input
 from stereokit_refiners.runtimes.torch import Module, calibrate
 from stereokit_refiners.weights import WeightFile, read, write
 
-__all__ = ["fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
+__all__ = ["LOSSES", "Source", "fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
+
+LOSSES = ("general", "d1")
+"""What an error counts: soft counts of those over about 1 and 3 pixels; or of those over 3 pixels alone, KITTI's."""
 
 _FIELDS: dict[str, tuple[int, Any]] = {
     "input": (sum(CHANNELS.values()), np.int8),
@@ -48,6 +53,7 @@ _OCCLUDED = 0.3  # weight of pixels that the right camera does not see
 _HARM = 0.7  # how much more it counts to make a pixel worse than to make another one better by as much
 _EXACT = ("up_1_sum", "merge_0")
 """Activations that are not held to 8 bits: what logits are made of. It takes hardly longer."""
+_MOST_SMALL = 10_000  # samples in a row that are smaller than a crop
 _TOO_HARD = 0.25  # samples with a larger share of outliers teach nothing
 
 
@@ -94,13 +100,29 @@ class _Keeper:
 
 def make_sample(
     left: NDArray[np.uint8], right: NDArray[np.uint8], truth: NDArray[np.float32], seen: NDArray[np.bool_],
-    method: str, scale: float, **options: Any,
+    method: str, scale: float, *, max_disparity: int = 0, **options: Any,
 ) -> tuple[NDArray[np.uint8], float]:  # fmt: skip
-    """Match a pair; return what the network sees and should make of it, and the coarse map's share of outliers."""
-    known = np.isfinite(truth) & (truth > 0)  # 0 is the sky
-    farthest = float(truth[known].max())
+    """Match a pair; return what the network sees and should make of it, and the coarse map's share of outliers.
+
+    Parameters
+    ----------
+    left, right : (H, W) uint8
+    truth : (H, W) float32
+        Pixels; NaN and 0 (the sky) are unknown.
+    seen : (H, W) bool
+        Where the right camera sees it too.
+    method : str
+        As `stereokit.Matcher` takes it.
+    scale : {1, 0.5, 0.25}
+    max_disparity : int
+        The search goes so far at least, pixels; it always holds the largest of the truth.
+    **options
+        Of the matcher.
+    """
+    known = np.isfinite(truth) & (truth > 0)
+    farthest = float(truth[known].max(initial=0))
     keeper = _Keeper()
-    levels = int(np.ceil((farthest + 8) / 32) * 32)
+    levels = max(max_disparity, int(np.ceil((farthest + 8) / 32) * 32))
     stereokit.Matcher(
         method, max_disparity=levels, scale=scale, refiner=keeper, threads=1, device="cpu", **options
     )(left, right)  # fmt: skip
@@ -121,9 +143,11 @@ def make_sample(
         "miss": _folded(miss, 4),
         "kind": _folded(kind, 4),
     }
-    error = np.abs(upscaled - truth)[seen & known]
-    outliers = (error > 3) & (error > 0.05 * truth[seen & known])
-    return packed(fields)[: left.shape[0] // 4, : left.shape[1] // 4], float(outliers.mean())
+    scored = seen & known if (seen & known).any() else known
+    error = np.abs(upscaled - truth)[scored]
+    outliers = (error > 3) & (error > 0.05 * truth[scored])
+    share = float(outliers.sum() / max(1, outliers.size))
+    return packed(fields)[: left.shape[0] // 4, : left.shape[1] // 4], share
 
 
 def photographed(
@@ -170,7 +194,7 @@ def _store(pairs: Path, folder: Path, most: int) -> None:
                 left, right = photographed(left, right, rng)
             method = str(rng.choice(["S1", "S2", "S2", "S2", "S3", "S4", "S4"]))
             scale = float(rng.choice([1, 0.5, 0.5, 0.5, 0.25] if number else [1, 0.5, 0.5]))
-            options = {} if rng.random() < 0.5 else {"smooth": float(0.5 * np.exp(rng.normal(0, 0.3)))}
+            options: dict[str, Any] = {} if rng.random() < 0.5 else {"smooth": float(0.5 * np.exp(rng.normal(0, 0.3)))}
             record, outliers = make_sample(left, right, truth.astype(np.float32), seen, method, scale, **options)
             name = folder / f"{path.stem}_{number:02d}_{method}_{1000 * outliers:03.0f}.npy"
             part = name.with_suffix(".part")
@@ -232,20 +256,22 @@ def mixture(head: Tensor, means: Tensor, others: Tensor, within: Tensor, apart: 
     return doubled(share) * F.pixel_shuffle(within, 4)[:, 0] + doubled(rest)
 
 
-def _badness(error: Tensor) -> Tensor:
-    """Return what an error counts: soft counts of those over about 1 and over about 3 pixels, and a clipped L1."""
+def _badness(error: Tensor, objective: str) -> Tensor:
+    """Return what an error counts, one of `LOSSES`; both have a clipped L1 beside the soft counts."""
+    if objective == "d1":
+        return 3 * torch.sigmoid(2 * (error - 3)) + 0.25 * error.clamp(max=20)
     square = error * error
     return square / (square + 0.6) + 0.7 * square / (square + 7) + 0.08 * error.clamp(max=30)
 
 
-def loss(head: Tensor, fields: dict[str, Tensor], apart: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the loss, and that of the coarse map alone."""
+def loss(head: Tensor, fields: dict[str, Tensor], apart: Tensor, objective: str = "general") -> tuple[Tensor, Tensor]:
+    """Return the loss, and that of the coarse map alone; `objective` is one of `LOSSES`."""
     within = fields["within"].float()
     out = mixture(head, fields["means"], fields["others"].float(), within, apart)
     miss, kind = (F.pixel_shuffle(fields[name].float(), 4)[:, 0] for name in ("miss", "kind"))
     weight = (kind == 1).float() + _OCCLUDED * (kind == 2).float()
     error = (out - F.pixel_shuffle(within, 4)[:, 0] - miss).abs()
-    now, before = _badness(error), _badness(miss.abs())
+    now, before = _badness(error, objective), _badness(miss.abs(), objective)
     total = weight.sum().clamp(min=1)
     main = ((now + _HARM * F.relu(now - before)) * weight).sum() / total
     right = F.avg_pool2d((error.detach() < 1.5).float()[:, None], 2)
@@ -262,19 +288,52 @@ def _begun(module: Module) -> None:
         bias[LOGITS : LOGITS + GAINS] = 0.1
 
 
-def _batches(folder: Path, batch: int, size: tuple[int, int], rng: np.random.Generator) -> Iterator[dict[str, Tensor]]:
-    """Yield random crops, `size` blocks of 4x4 pixels each; the folder is looked at again every minute."""
-    seen = -1e9
+@dataclass(frozen=True)
+class Source:
+    """Samples of one origin.
+
+    Parameters
+    ----------
+    samples : Path or sequence of Path
+        A folder that may still grow, of which samples are drawn the less the more of them is wrong; or files, alike.
+    share : float
+        Of the steps, beside the other sources' shares.
+    """
+
+    samples: Path | Sequence[Path]
+    share: float = 1.0
+
+    def listed(self) -> tuple[list[Path], NDArray[np.float64]]:
+        """Return the files that there are now, and their sums of shares."""
+        if not isinstance(self.samples, Path):
+            return list(self.samples), np.arange(1.0, len(self.samples) + 1)
+        paths = sorted(self.samples.glob("*.npy"))
+        outliers = np.array([int(path.stem.rpartition("_")[2]) / 1000 for path in paths])
+        return paths, np.where(outliers > _TOO_HARD, 0, 1 / (1 + (outliers / 0.12) ** 2)).cumsum()
+
+
+def _batches(
+    sources: Sequence[Source], batch: int, size: tuple[int, int], rng: np.random.Generator
+) -> Iterator[dict[str, Tensor]]:
+    """Yield random crops of one source at a time, `size` blocks of 4x4 pixels each; folders are looked at each minute.
+
+    Crops of dense truth beside those of sparse truth would have most of a step's known pixels.
+    """
+    looked = -1e9
+    parts = np.cumsum([source.share for source in sources])
     while True:
-        if time.monotonic() - seen > 60:
-            paths = sorted(folder.glob("*.npy"))
-            outliers = np.array([int(path.stem.rpartition("_")[2]) / 1000 for path in paths])
-            shares = np.where(outliers > _TOO_HARD, 0, 1 / (1 + (outliers / 0.12) ** 2)).cumsum()
-            seen = time.monotonic()
+        if time.monotonic() - looked > 60:
+            listed = [source.listed() for source in sources]
+            looked = time.monotonic()
+        paths, shares = listed[int(np.searchsorted(parts, rng.random() * parts[-1]))] if len(sources) > 1 else listed[0]
         crops: list[NDArray[np.uint8]] = []
+        small = 0
         while len(crops) < batch:
             record = np.load(paths[int(np.searchsorted(shares, rng.random() * shares[-1]))], mmap_mode="r")
             if record.shape[0] < size[0] or record.shape[1] < size[1]:
+                small += 1
+                if small > _MOST_SMALL:
+                    raise OptionError(f"crops must fit into the samples, got {4 * size[0]}x{4 * size[1]} pixels")
                 continue
             y, x = (int(rng.integers(0, record.shape[k] - size[k] + 1)) for k in (0, 1))
             crops.append(np.array(record[y : y + size[0], x : x + size[1]]))
@@ -293,16 +352,16 @@ def _by_steps(arrays: Mapping[str, NDArray[np.float32]], factor: float) -> dict[
 
 
 def fit(
-    folder: Path, output: Path, *, steps: int = 30000, rate: float = 2e-3, batch: int = 4, seed: int = 0,
-    start: Path | None = None, size: tuple[int, int] = (64, 96), notes: dict[str, Any] | None = None,
-    report: int = 200,
+    samples: Path | Sequence[Source], output: Path, *, steps: int = 30000, rate: float = 2e-3, batch: int = 4,
+    seed: int = 0, start: Path | None = None, size: tuple[int, int] = (64, 96), objective: str = "general",
+    notes: dict[str, Any] | None = None, report: int = 200,
 ) -> WeightFile:  # fmt: skip
     """Train on stored samples, from a checkpoint if there is one, and write the weights.
 
     Parameters
     ----------
-    folder : Path
-        Of samples.
+    samples : Path or sequence of Source
+        A folder of them, or several sources.
     output : Path
         Weight file; the checkpoint is beside it, ``.pt``.
     steps, batch, seed : int
@@ -312,6 +371,8 @@ def fit(
         Weight file to begin with.
     size : tuple of int
         Crops in blocks of 4x4 pixels, multiples of 8.
+    objective : {"general", "d1"}
+        One of `LOSSES`.
     notes : dict or None
         For the weight file.
     report : int
@@ -332,7 +393,8 @@ def fit(
         optimizer.load_state_dict(held["optimizer"])
         average, done = held["average"], held["done"]
     rng = np.random.default_rng([seed, done])
-    batches = _batches(folder, batch, size, rng)
+    sources = [Source(samples)] if isinstance(samples, Path) else samples
+    batches = _batches(sources, batch, size, rng)
     compiled = torch.compile(loss)
     saved = time.monotonic()
     while done < steps:
@@ -344,7 +406,7 @@ def fit(
         apart = torch.where(given[:, _FIRST["scale"], 0, 0] > 0.5, 2.0, 1.0)
         with torch.autocast("cpu", torch.bfloat16):
             head = module({"evidence": given})["map"]
-        value, before = compiled(head.float().contiguous(), fields, apart)
+        value, before = compiled(head.float().contiguous(), fields, apart, objective)
         optimizer.zero_grad()
         value.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(module.parameters(), 5.0)

@@ -30,7 +30,18 @@ from stereokit.notices import collecting
 from stereokit.result import Disparity
 from stereokit_refiners.training.augment import Views, copy_paste, mirrored, photographed, rescaled
 
-__all__ = ["Crop", "Pair", "Sample", "SampleFiles", "crop", "load_variant", "make_variant", "store_variant", "whole"]
+__all__ = [
+    "Crop",
+    "Pair",
+    "Sample",
+    "SampleFiles",
+    "crop",
+    "drawn_options",
+    "load_variant",
+    "make_variant",
+    "store_variant",
+    "whole",
+]
 
 _STEP = np.float32(1 / 256)  # of a pixel, as in KITTI
 _HERE = Path(__file__)
@@ -207,7 +218,7 @@ def make_variant(pair: Pair, method: str, seed: int, number: int, max_disparity:
         if number % 2 == 0 and np.isfinite(views.noc).any():
             views = mirrored(views)
         views = photographed(rng, rescaled(rng, copy_paste(rng, views)))
-        options = _drawn_options(rng, method)
+        options = drawn_options(rng, method)
     noc, occ = views.noc, views.occ
     left, right = _even(views.left), _even(views.right)
     capture = _CaptureCoarse()
@@ -247,7 +258,7 @@ def _even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
 
 
-def _drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
+def drawn_options(rng: np.random.Generator, method: str) -> dict[str, Any]:
     """Return the matcher's options, drawn around the defaults of `stereokit.defaults`."""
     name = parse_method(method)
     base = defaults_of(name, half=True)

@@ -67,6 +67,7 @@ def write_all(folder: Path) -> None:
     write_bytes(folder / "penalties.jpg", jpeg(street.sheet(tuned)))
     write_bytes(folder / "confidence.jpg", jpeg(measured_and_sure(street)))
     write_bytes(folder / "depth_error.svg", depth_error())
+    write_bytes(folder / "memory.svg", memory())
 
 
 def jpeg(picture: np.ndarray) -> bytes:
@@ -115,6 +116,29 @@ def depth_error() -> bytes:
     axes.set(xlabel="distance, m", ylabel="depth error, m", yscale="log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.legend(frameon=False, loc="upper left")
+    return svg(figure, axes)
+
+
+def memory() -> bytes:
+    """Return a chart of the buffers of S2 by the size of the image, as the library measures them."""
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    rows = np.linspace(300, 3000, 40)
+    megapixels = rows * rows * 4 / 3 / 1e6
+    for levels, color in ((128, "tab:green"), (256, "tab:blue"), (512, "tab:red")):
+        for search, style in (("full", "--"), ("coarse-to-fine", "-")):
+            matcher = Matcher("S2", max_disparity=levels, search=search, threads=1)
+            megabytes = [matcher.nbytes(round(y), round(4 / 3 * y)) / 1e6 for y in rows]
+            axes.plot(megapixels, megabytes, style, color=color)
+            if search == "full":
+                axes.text(megapixels[-1] + 0.1, megabytes[-1], f"{levels} levels, full", va="center", fontsize=9)
+    axes.text(megapixels[-1] + 0.1, 0.9 * megabytes[-1], "all, coarse-to-fine", va="top", fontsize=9)
+    axes.set(xlabel="megapixels", ylabel="MB of buffers, S2, one thread", xlim=(0, 12), ylim=(0, None))
+    return svg(figure, axes)
+
+
+def svg(figure: Figure, axes: Any) -> bytes:
+    """Return a chart as a file."""
     axes.spines[["top", "right"]].set_visible(False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})

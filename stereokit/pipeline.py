@@ -24,7 +24,7 @@ from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.postprocess.chain import post_process
 from stereokit.result import Disparity
-from stereokit.search import halved_levels, plan_search, restore_thin
+from stereokit.search import EXPECTED_CONFIDENCE, halved_levels, plan_search, restore_thin
 from stereokit.selection.wta import selection_output
 from stereokit.settings import Detail, MatchSettings
 
@@ -86,19 +86,8 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     """
     if settings.refiner is None:
         return coarse
-    keywords: dict[str, Any] = {}
-    if getattr(settings.refiner, "any_scale", False):
-        keywords["scale"] = settings.scale
-    if getattr(settings.refiner, "needs_right", False):
-        keywords["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
     with span("refine", "refine"):
-        full = settings.refiner(coarse, pair.guide, threads=threads, **keywords)
-    if not isinstance(full, Disparity) or full.disparity.shape != pair.guide.shape:
-        received = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
-        size = pair.guide.shape
-        raise OptionError(
-            f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {received}"
-        )
+        full = _refine(settings, coarse, pair, settings.scale, threads)
     disparity = full.disparity
     if getattr(settings.refiner, "needs_right", False):  # it measures for itself, and may leave the range
         levels = settings.levels
@@ -106,6 +95,24 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     elif settings.floor is not None:
         disparity = np.maximum(disparity, np.float32(settings.floor))
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
+
+
+def _refine(settings: MatchSettings, coarse: Disparity, pair: GrayPair, scale: float, threads: int) -> Disparity:
+    """Return what the refiner makes of a map; OptionError if that has not the size of the image."""
+    refiner: Any = settings.refiner
+    keywords: dict[str, Any] = {}
+    if getattr(refiner, "any_scale", False):
+        keywords["scale"] = scale
+    if getattr(refiner, "needs_right", False):
+        keywords["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
+    full: Any = refiner(coarse, pair.guide, threads=threads, **keywords)
+    if not isinstance(full, Disparity) or full.disparity.shape != pair.guide.shape:
+        received = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
+        size = pair.guide.shape
+        raise OptionError(
+            f"refiner {settings.refiner_name!r} must return a Disparity of the image's {size}, got {received}"
+        )
+    return full
 
 
 def with_blank(pair: GrayPair, settings: MatchSettings, threads: int) -> GrayPair:
@@ -190,7 +197,11 @@ class CpuPipeline:
             if pair.ranges is None and getattr(self.settings.cost, "needs_ranges", False):
                 left, right = ((int(view.min()), int(view.max())) for view in (smoothed.left, smoothed.right))
                 half = replace(half, ranges=(left, right))  # all sizes have one range, as in windows of larger images
-        coarse = self._map(half, halved_levels(levels), None, workspace.part("half"), threads)
+        refines = is_matched_size and self.settings.refines_search
+        detail = self.settings.detail if refines else Detail.DISPARITY
+        coarse = self._map(half, halved_levels(levels), detail, workspace.part("half"), threads, plans=True)
+        if refines:
+            coarse = self._refined_guide(coarse, half, halved_levels(levels), threads)
         with span("prepare", "search ranges"):
             shape = pair.left.shape
             search = Search(
@@ -201,10 +212,22 @@ class CpuPipeline:
             plan_search(coarse.disparity, coarse.valid, levels, search, threads)
         return search
 
+    def _refined_guide(self, coarse: Disparity, half: GrayPair, levels: Levels, threads: int) -> Disparity:
+        """Return the half-size map as the refiner makes it, called measured where it is sure; thin things stay."""
+        with span("refine", "refine at half size"):
+            better = _refine(self.settings, coarse, half, 1, threads)
+        lowest, highest = np.float32(levels.minimum), np.float32(levels.minimum + levels.count - 1)
+        disparity = np.clip(better.disparity, lowest, highest)
+        disparity = np.where(np.isnan(disparity), coarse.disparity, disparity)
+        restore_thin(coarse.disparity, disparity, threads)
+        sure = coarse.valid if better.confidence is None else better.confidence > EXPECTED_CONFIDENCE
+        return Disparity(disparity, sure if half.left_blank is None else sure & ~half.left_blank)
+
     def _map(
-        self, pair: GrayPair, levels: Levels, detail: Detail | None, workspace: Workspace, threads: int
-    ) -> Disparity:
-        """Return the map of a pair at its own size; without a `detail`, filled and for the search of the next size."""
+        self, pair: GrayPair, levels: Levels, detail: Detail, workspace: Workspace, threads: int, *,
+        plans: bool = False,
+    ) -> Disparity:  # fmt: skip
+        """Return the map of a pair at its own size; one that `plans` the search of the next size is filled."""
         settings = self.settings
         cost, aggregation = settings.cost, settings.aggregation
         guide = pair.guide
@@ -232,8 +255,8 @@ class CpuPipeline:
             )
         disparity = workspace.array("match.disparity", shape, np.float32)
         total = workspace.array("match.cost", shape, aggregation.total_dtype)
-        confidence = np.empty(shape, np.float32) if (detail or 0) >= Detail.CONFIDENCE else None
-        candidates = np.empty((2, *shape), np.float32) if (detail or 0) >= Detail.CANDIDATES else None
+        confidence = np.empty(shape, np.float32) if detail >= Detail.CONFIDENCE else None
+        candidates = np.empty((2, *shape), np.float32) if detail >= Detail.CANDIDATES else None
         searched = levels.count if starts is None else LANES
         out = selection_output(
             disparity, total, confidence, searched, levels.minimum, settings.subpixel, settings.uniqueness,
@@ -243,14 +266,14 @@ class CpuPipeline:
         with span("match", "sweep, around its kernels"):
             aggregation.sweep(rows, levels, cost, guide, workspace, threads, out, **keywords)
         selected = None
-        if detail is None:
+        if plans:
             selected = workspace.array("match.selected", shape, np.float32)
             np.copyto(selected, disparity)
         with span("clean", "post-processing"):
             chain = settings.post_processing(disparity.size)
-            if detail is None:
+            if plans:
                 chain = replace(chain, fill="nearest", median=_HALF_SIZE_MEDIAN, empty_value=levels.minimum)
-            bad = pair.left_bad if detail is not None else None
+            bad = None if plans else pair.left_bad
             disparity, valid = post_process(disparity, total, bad, chain, workspace, threads)
             if selected is not None:
                 restore_thin(selected, disparity, threads)

@@ -27,12 +27,17 @@ from stereokit.kernels.jit import kernel
 from stereokit.kernels.simd import LANES
 from stereokit.kernels.threads import run, spans
 
-__all__ = ["SEARCHED_IN_FULL", "SEARCHES", "halved_levels", "plan_search", "restore_thin"]
+__all__ = ["EXPECTED_CONFIDENCE", "SEARCHED_IN_FULL", "SEARCHES", "halved_levels", "plan_search", "restore_thin"]
 
 SEARCHES = ("auto", "full", "coarse-to-fine")
 """Values of the option `search`."""
 SEARCHED_IN_FULL = LANES
 """Levels up to which "auto" searches in full: fewer leave nothing to save."""
+
+EXPECTED_CONFIDENCE = 0.5
+"""Of a refined half-size map, the confidence from which its value counts as measured. Over the pairs of the model
+card full size with the general refiner has 0.748 times the error of S2 without one (geometric mean of 24 figures),
+0.769 with 0.75, and 0.789 where the half-size map is not refined."""
 
 _RADIUS = 4  # of the neighbourhood, half-size pixels
 _MARGIN = 6.0  # above and below what it holds, levels

@@ -213,6 +213,12 @@ class MatchSettings:
         return self.search == "coarse-to-fine" and self.matched_levels.count >= LANES
 
     @property
+    def refines_search(self) -> bool:
+        """Whether the refiner improves the half-size map that says where to search: one that takes any size can."""
+        takes_any = all(getattr(self.refiner, name, False) for name in ("any_scale", "needs_right"))
+        return self.scale == 1 and self.coarse_to_fine and takes_any
+
+    @property
     def searched(self) -> int | None:
         """Levels that a pixel tries at most; None for all."""
         return LANES if self.coarse_to_fine else None

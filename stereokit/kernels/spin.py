@@ -31,8 +31,8 @@ WORDS_APART = 8
 
 _BUSY_LOOKS = 256
 """Looks, each some tens of nanoseconds, before the processor is offered to others between looks."""
-_LOOKS_AWAKE = 1_000
-"""Looks before the first sleep between two: a few hundred microseconds where nobody else wants the processor."""
+_LOOKS_AWAKE = 300
+"""Looks before the first sleep between two: some tens of microseconds where nobody else wants the processor."""
 _SLEEPS = 60
 """Sleeps of `spin_while`, some milliseconds in all."""
 _SLEEP_MICROSECONDS = 50

@@ -22,6 +22,7 @@ from stereokit.images.gray import GrayPair
 from stereokit.images.resize import half_size
 from stereokit.kernels.simd import LANES
 from stereokit.kernels.workspace import Workspace
+from stereokit.result import Disparity
 from stereokit.search import halved_levels, plan_search, restore_thin
 from stereokit.selection.wta import selection_output
 
@@ -432,3 +433,56 @@ def test_the_command_line_takes_it(tmp_path):
     assert "coarse-to-fine" in json.dumps(json.loads((tmp_path / "j.json").read_text()))
     failed = CliRunner().invoke(app.app, [*base, "--set", "search=fast"])
     assert failed.exit_code == 2
+
+
+class Opinionated:
+    """A refiner of any size that says the same of every pixel of a half-size map, and leaves others as they are."""
+
+    needs_candidates = needs_confidence = needs_right = any_scale = True
+
+    def __init__(self, disparity, confidence):
+        self.disparity, self.confidence = disparity, confidence
+        self.calls = []
+
+    def __call__(self, coarse, left, *, right, scale, threads=1):
+        self.calls.append((left.shape, right.shape, coarse.disparity.shape, scale))
+        assert coarse.confidence is not None and coarse.candidates is not None and left.dtype == np.uint8
+        if len(self.calls) % 2 == 0:
+            return coarse
+        shape = coarse.disparity.shape
+        return Disparity(
+            np.full(shape, self.disparity, np.float32),
+            np.ones(shape, np.bool_),
+            np.full(shape, self.confidence, np.float32),
+        )
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_refiner_of_any_size_refines_the_half_size_map_too(kind):
+    left = np.repeat(
+        np.arange(41, dtype=kind)[:, None] * 5, 121, axis=1
+    )  # all disparities fit: what is expected decides
+    right = left.copy()
+    shares = []
+    for confidence in (0.2, 0.9):
+        refiner = Opinionated(45.0, confidence)
+        options = {"max_disparity": 140, "refiner": refiner, "threads": 1, "smp": False, "speckle": 0}
+        disparity = Matcher("S2", **options)(left, right).disparity
+        shares.append(float((np.abs(disparity[:, :50] - 90) <= 4).mean()))  # twice the opinion
+        half, full = refiner.calls
+        assert half == ((21, 61), (21, 61), (21, 61), 1) and full == ((41, 121), (41, 121), (41, 121), 1)
+    assert shares == [0, 1]  # what is not sure is not expected
+
+
+def test_other_refiners_see_the_full_size_map_alone():
+    class Plain(Opinionated):
+        needs_right = False
+
+        def __call__(self, coarse, left, *, scale, threads=1):
+            self.calls.append(left.shape)
+            return coarse
+
+    refiner = Plain(0, 0)
+    left, right = np.random.default_rng(0).integers(0, 256, (2, 20, 150)).astype(np.uint8)
+    Matcher("S2", max_disparity=100, refiner=refiner, threads=1)(left, right)
+    assert refiner.calls == [(20, 150)]

@@ -44,7 +44,9 @@ class Refiner(Protocol):
     ``confidence``, or with both. One that looks at the right image too has a ``needs_right`` that is True, and is
     called with ``right=``, of the size and type of `left`. One that takes maps of other sizes has an ``any_scale``
     that is True, and is called with ``scale=``, the size at which was matched: 1, 0.5 or 0.25; rows and columns of
-    the coarse map are those of `left` times that, rounded up. One that can work on the GPU has a method
+    the coarse map are those of `left` times that, rounded up. One that has both may be called two times for one pair:
+    at full size with ``scale=1`` it first refines the pair of half the size, with ``scale=1`` too, whose map tells a
+    search from coarse to fine where to look. One that can work on the GPU has a method
     ``on_device``, a `DeviceRefiner`, for `stereokit.Matcher.on_device`.
     """
 

@@ -11,6 +11,8 @@ Arrays and their places (``P`` levels to a pixel, one byte each; all rows of one
     sums          (H, W, P)   sum of the three brackets of the sweep that came first; the only volume
     path_minimum  (H, W)      smallest path cost of each pixel, where `sums` holds path costs instead (see below)
 
+Each worker has buffers of its own but for `state` and `lowest`, which belong to a sweep, and the last two.
+
 The diagonal paths stay in place: the path that arrives at column ``x`` in sweep row ``k`` lives in slot ``x - k``
 (modulo W), or ``x + k`` for the other diagonal, so nothing is ever shifted.
 

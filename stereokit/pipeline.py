@@ -168,6 +168,7 @@ class CpuPipeline:
 
     def __init__(self, settings: MatchSettings) -> None:
         self.settings = settings
+        self._refines = settings.refines_search
         self._workspaces = Pool(Workspace)
         self._growth: dict[tuple[np.dtype[Any], int], NDArray[np.float64]] = {}  # of the buffers, by image and threads
 
@@ -197,7 +198,7 @@ class CpuPipeline:
             if pair.ranges is None and getattr(self.settings.cost, "needs_ranges", False):
                 left, right = ((int(view.min()), int(view.max())) for view in (smoothed.left, smoothed.right))
                 half = replace(half, ranges=(left, right))  # all sizes have one range, as in windows of larger images
-        refines = is_matched_size and self.settings.refines_search
+        refines = is_matched_size and self._refines
         detail = self.settings.detail if refines else Detail.DISPARITY
         coarse = self._map(half, halved_levels(levels), detail, workspace.part("half"), threads, plans=True)
         if refines:
@@ -302,5 +303,7 @@ class CpuPipeline:
         """Return the bytes of the buffers of one match, after matching a made-up pair."""
         image = (np.arange(height * width, dtype=np.uint32) * 2654435761 >> 16).astype(dtype).reshape(height, width)
         workspace = Workspace()
-        self._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, threads)
+        probe = CpuPipeline(self.settings)
+        probe._refines = False  # a refiner's buffers are its own
+        probe._coarse(GrayPair(image, image, None, None, image.astype(np.uint8)), workspace, threads)
         return workspace.nbytes

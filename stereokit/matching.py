@@ -281,8 +281,8 @@ class Matcher:
         """Match a sequence of pairs, as many at a time as are waiting.
 
         Frames in parallel use the processors better than threads within a frame, so each frame gets one thread where
-        as many wait as there are threads, and its share of them where fewer do, as from a camera or at the end. The
-        results are those of one call per pair, and come in the order of the pairs.
+        as many wait as there are threads when it begins, and its share of them where fewer do, as in short sequences
+        and from slow sources. The results are those of one call per pair, and come in the order of the pairs.
 
         Parameters
         ----------

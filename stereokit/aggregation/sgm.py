@@ -296,14 +296,19 @@ def _meet(
 
     def end(sweep: int, k: int, part: _Part, words: NDArray[np.int64]) -> None:
         with span("match", "sweep: last visit"):
-            last(sweep, k, part, words)
+            try:
+                last(sweep, k, part, words)
+            except BaseException:  # of a cost of the user's: nobody may wait for its rows
+                words[:] = 1 << 40
+                raise
 
     def words_for(rows: int) -> NDArray[np.int64]:
         return np.zeros((2 + rows // 2) * WORDS_APART, np.int64)
 
     begins = [partial(begin, sweep, (*way, *band)) for band in bands for sweep, way in enumerate(ways)]
     if (own := runner()) is not None:
-        own.side_by_side(begins)
+        if begins:
+            own.side_by_side(begins)
 
         def line(sweep: int) -> Iterator[Callable[[], None]]:
             return (partial(end, sweep, sweep % workers, pair, words_for(2)) for pair in _pairs(parts[sweep]))

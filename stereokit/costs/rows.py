@@ -19,6 +19,7 @@ too, and one vector load brings 64 of them::
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +28,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.errors import OptionError
 from stereokit.kernels.jit import by_types, inline, kernel
 from stereokit.kernels.simd import LANES, aligned, bitwise_or, load, maximum, minimum, splat, store
 from stereokit.kernels.threads import run, spans
@@ -187,6 +189,9 @@ def implements(kind: type) -> Callable[[Callable[..., None]], Callable[..., None
     """Return a decorator that makes a compiled function the `cost_row` of the named tuple `kind`."""
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
+        names = tuple(inspect.signature(getattr(function, "py_func", function)).parameters)
+        if len(names) != 5:
+            raise OptionError(f"function of cost rows must take (rows, y, x0, x1, out), got ({', '.join(names)})")
         _PRODUCERS[kind] = function
         return function
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
 from stereokit.kernels.jit import kernel
-from stereokit.kernels.threads import run, spans
+from stereokit.kernels.threads import run, run_stages, spans
 from stereokit.kernels.workspace import Workspace
 
 __all__ = ["half_size", "reduced", "reduced_mask", "smooth"]
@@ -51,19 +51,22 @@ def smooth(
     deep, blurred = ([buffers.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
     reach = int(np.ceil(4 * sigma)) + 1  # of the kernel that OpenCV takes, at most
 
+    def deepen(k: int, y0: int, y1: int) -> None:
+        np.multiply(images[k][y0:y1], np.uint16(256), out=deep[k][y0:y1])
+
     def blur(k: int, y0: int, y1: int) -> None:
         """Smooth a band of rows: with more rows than it has, so that those are like in the whole."""
         first, behind = max(y0 - reach, 0), min(y1 + reach, height)
-        image = images[k][first:behind]
-        if image.dtype == np.uint8:
-            image = np.multiply(image, np.uint16(256), out=deep[k] if len(bands) == 1 else None)
+        image = (deep[k] if images[k].dtype == np.uint8 else images[k])[first:behind]
         if len(bands) == 1:
             cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
             return
         band = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
         blurred[k][y0:y1] = band.reshape(image.shape)[y0 - first : y1 - first]
 
-    run([partial(blur, k, *band) for band in bands for k in (0, 1)], threads)
+    parts = [(k, *band) for band in bands for k in (0, 1)]
+    deepened = [partial(deepen, *part) for part in parts] if images[0].dtype == np.uint8 else []
+    run_stages([deepened, [partial(blur, *part) for part in parts]], threads)
     left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
     return replace(pair, left=left, right=right)
 

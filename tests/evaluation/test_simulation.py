@@ -87,6 +87,7 @@ def test_more_cores_are_never_slower_and_one_has_no_gain():
     one, many = simulate("S2", 64, left, left, (1, 16), 1, clock=lambda: float(next(ticks)))
     assert one.cores == 1 and many.cores == 16
     assert many.path_ms <= many.cores_ms + 1e-6 and one.path_ms <= one.cores_ms + 1e-6
+    assert simulate("S2", 64, left, left, (4,), 1, paths=5)[0].cores_ms > 0
     assert 0 < many.serial_share and many.traffic_mb > 0 and many.hand_overs >= one.hand_overs > 0
 
 

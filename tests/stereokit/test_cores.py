@@ -2,17 +2,23 @@
 
 import threading
 import time
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from stereokit import Matcher
+from stereokit.aggregation.sgm import Sgm
+from stereokit.costs.rows import CostInput, Levels, implements
+from stereokit.errors import OptionError
 from stereokit.images.gray import gray_pair
 from stereokit.images.resize import half_size, smooth
 from stereokit.kernels import threads as workers
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.spin import WORDS_APART, claim, publish, wait_until
+from stereokit.kernels.workspace import Workspace
 from stereokit.search import restore_thin
+from stereokit.selection.wta import selection_output
 
 
 @pytest.fixture
@@ -145,3 +151,55 @@ def test_who_waits_long_leaves_the_processor_to_others():
     words[0] = 1
     thread.join()
     assert used[0] < 0.5 * (time.perf_counter() - began)
+
+
+class FailingRows(NamedTuple):
+    """Rows of costs of which some cannot be had."""
+
+    left: np.ndarray
+    padded: int
+
+
+@implements(FailingRows)
+@kernel
+def _failing_row(rows, y, x0, x1, out):
+    """Write zeros; fail in rows that begin with 255, of whole rows alone, which the last visits ask for."""
+    for at in range(x0 * rows.padded, x1 * rows.padded):
+        out[at] = 0
+    if rows.left[y, 0] == 255 and x1 - x0 == rows.left.shape[1]:
+        raise ValueError("no such row")
+
+
+class Failing:
+    """A cost that fails in some rows."""
+
+    name, cost_max, unit, costly_to_recompute = "failing", 60, 1, False
+
+    def prepare(self, pair, workspace, workers):
+        return [FailingRows(pair.left, pair.levels.padded)] * workers
+
+
+@pytest.mark.parametrize("threads", [1, 3, 8])
+def test_a_cost_that_fails_in_one_row_leaves_nobody_waiting(many_workers, threads):
+    left = np.zeros((64, 200), np.uint8)
+    left[40, 0] = 255
+    levels, workspace = Levels(0, 64), Workspace()
+    out = selection_output(np.empty(left.shape, np.float32), np.empty(left.shape, np.uint16), None, 64, 0, True)
+    rows = Failing().prepare(CostInput(left, left, None, None, levels, 0.5), workspace, threads)
+    for _ in range(5):
+        with pytest.raises(ValueError, match="no such row"):
+            Sgm(p1=3, p2=17).sweep(rows, levels, Failing(), left, workspace, threads, out)
+
+
+def test_a_cost_row_of_another_form_is_refused_in_one_line():
+    with pytest.raises(OptionError, match=r"must take \(rows, y, x0, x1, out\), got \(rows, y, out\)"):
+        implements(FailingRows)(lambda rows, y, out: None)
+
+
+@pytest.mark.parametrize("method", ["S1", "S2", "S4"])
+@pytest.mark.parametrize("threads", [1, 2, 5, 90])
+def test_the_bytes_of_the_buffers_are_known_for_any_number_of_threads(method, threads):
+    matcher = Matcher(method, max_disparity=64, threads=threads)
+    actual = matcher._pipeline._buffer_nbytes(600, 500, np.uint8, threads)
+    most = 2 if method == "S1" else 1.15  # the columns of DT are shared out by fewer than 90
+    assert 0.95 * actual < matcher.nbytes(600, 500) < most * actual

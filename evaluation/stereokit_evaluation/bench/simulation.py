@@ -29,7 +29,7 @@ from stereokit_evaluation.bench.table import new_table
 __all__ = ["Lines", "Simulated", "Tasks", "TimedTasks", "makespan", "print_simulated", "simulate"]
 
 _HAND_OVERS = 200
-"""Empty stages whose mean time is that of a hand-over."""
+"""Empty stages, of whose times the first quartile is that of a hand-over."""
 
 
 @dataclass(frozen=True)

@@ -245,6 +245,8 @@ def _stored_model(folder: Path, name: str, contents: dict[str, str], cache: Path
         with parsing(folder / name, "model"):
             content = pack(read_model(name, read_bytes(folder / name), fetch))
     except FileError as error:
+        if isinstance(error.__cause__ or error.__context__, (ImportError, MemoryError)):
+            raise  # of this machine, not of the file
         fault = str(error)
     else:
         file = f"model-{hashlib.sha256(content).hexdigest()[:16]}.npz"

@@ -7,7 +7,6 @@ command goes on where it was killed. Held-out frames are scored by the refiner i
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 import zlib
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ import stereokit
 from stereokit.cli.options import parse_settings
 from stereokit.errors import OptionError
 from stereokit.images.check import check_integer, check_number
-from stereokit.io import make_folder
+from stereokit.io import make_folder, write_bytes
 from stereokit.notices import collecting
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.data.frame import Frame
@@ -235,7 +234,7 @@ def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:  # a file system without links
-        shutil.copyfile(source, target)
+        write_bytes(target, source.read_bytes())
 
 
 def _settings(texts: Sequence[str]) -> dict[str, Any]:

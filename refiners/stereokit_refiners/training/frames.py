@@ -28,7 +28,10 @@ __all__ = ["frame_sample", "store_frame"]
 _SCALES, _SHARES = (0.5, 1.0, 0.25), (0.7, 0.15, 0.15)
 _POOR = 0.2  # share of the samples whose camera is one of `evidence.photographed`
 _HERE = Path(__file__)
-_SOURCES = (_HERE, _HERE.with_name("augment.py"), _HERE.parents[1] / "runtimes" / "evidence.py")
+_SOURCES = (
+    *(_HERE.with_name(f"{name}.py") for name in ("augment", "evidence", "frames", "samples")),
+    *(_HERE.parents[1] / name / "evidence.py" for name in ("networks", "runtimes")),
+)
 _OWN = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES)).hexdigest()[:8]
 
 

@@ -137,8 +137,13 @@ STORM = """
                 break
             except KeyboardInterrupt:
                 hits += 1
-        if tries % 10 == 0:
-            wrong += not is_right(calls[k], expected[k])
+        while tries % 10 == 0:
+            try:
+                wrong += not is_right(calls[k], expected[k])
+                break
+            except KeyboardInterrupt:  # a signal that the system gave to a thread without a processor comes late
+                hits += 1
+    time.sleep(0.2)
     for call, results in zip(calls, expected):
         wrong += not is_right(call, results)
     print(hits, "interrupts,", wrong, "wrong")

@@ -133,12 +133,12 @@ class Sgm:
         threads: int, out: SelectionOutput, total: NDArray[np.uint16] | None = None,
         search: Search | None = None,
     ) -> None:  # fmt: skip
-        """Aggregate the rows of two producers and select.
+        """Aggregate the rows of producers and select.
 
         Parameters
         ----------
-        rows : two row producers
-            One per sweep.
+        rows : list of row producers
+            One per thread, but two at least: two sweeps do not share one.
         levels : Levels
             Disparities.
         cost : Cost
@@ -161,17 +161,8 @@ class Sgm:
             return
         penalties, sums, sweeps = self._cached(guide.shape, levels, cost, workspace, threads)
         total_out = np.empty(0, np.uint16) if total is None else total.reshape(-1)
-        if len(sweeps) == 1:
-            start(sweeps[0][0], 0, guide.shape[1])
-
-        def first(sweep: int, k: int, part: _Part) -> None:
-            first_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, NEAR)
-
-        def last(sweep: int, k: int, part: _Part, words: NDArray[np.int64]) -> None:
-            both = len(sweeps) == 2
-            _last_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, both, out, total_out, words)
-
-        _meet(first, last, guide.shape, len(sweeps), len(sweeps[0]), self.paths == 4, threads)
+        kernels = start, first_visit, _last_visit
+        self._visit(kernels, rows, sweeps, guide, penalties, sums, threads, out, total_out)
 
     def _narrow_sweep(
         self, rows: list[Any], search: Search, cost: Cost, guide: NDArray[np.uint8], workspace: Workspace,
@@ -185,15 +176,24 @@ class Sgm:
         below[:LANES] = above[LANES + 1 :] = UNEXPECTED
         flat = Search(search.starts.ravel(), search.low.ravel(), search.high.ravel())
         sweeps = [[NarrowBuffers(buffers, flat, edges, below, above) for buffers in workers] for workers in paths]
-        if len(sweeps) == 1:
-            start_narrow(sweeps[0][0], 0, guide.shape[1])
+        kernels = start_narrow, first_narrow_visit, _last_narrow_visit
+        self._visit(kernels, rows, sweeps, guide, penalties, sums, threads, out)
+
+    def _visit(
+        self, kernels: tuple[Callable[..., None], ...], rows: list[Any], sweeps: list[list[Any]],
+        guide: NDArray[np.uint8], penalties: Penalties, sums: NDArray[Any], threads: int, *out: Any,
+    ) -> None:  # fmt: skip
+        """Visit all rows with the kernels that begin a sweep, visit rows first and visit rows last."""
+        begin, first_of, last_of = kernels
+        both = len(sweeps) == 2
+        if not both:
+            begin(sweeps[0][0], 0, guide.shape[1])
 
         def first(sweep: int, k: int, part: _Part) -> None:
-            first_narrow_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, NEAR)
+            first_of(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, NEAR)
 
         def last(sweep: int, k: int, part: _Part, words: NDArray[np.int64]) -> None:
-            both = len(sweeps) == 2
-            _last_narrow_visit(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, both, out, words)
+            last_of(rows[k], sweeps[sweep][k], guide, penalties, *part, sums, both, *out, words)
 
         _meet(first, last, guide.shape, len(sweeps), len(sweeps[0]), self.paths == 4, threads)
 

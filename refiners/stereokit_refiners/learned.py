@@ -16,6 +16,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import cv2
@@ -23,14 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.errors import DeviceError, OptionError, StereokitError
+from stereokit.kernels.workspace import Pool, Workspace
 from stereokit.notices import warn
 from stereokit.postprocess import fill
 from stereokit.registry import REFINERS
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
 from stereokit_refiners.linear import doubled, enlarged
+from stereokit_refiners.runtimes.contract import Run
 from stereokit_refiners.runtimes.encode import base_of, encode
-from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.evidence import hypotheses
+from stereokit_refiners.runtimes.features import network_input
 from stereokit_refiners.runtimes.mixture import mixture
 from stereokit_refiners.runtimes.reference import TOLERANCES_PX, input_size, mistake
 from stereokit_refiners.weights import WeightFile, find, network_named
@@ -54,9 +58,6 @@ BACKENDS = ("openvino", "onnxruntime", "torch", "opencv")
 PRECISIONS = ("fp32", "bf16", "int8")
 _MOST_COMPILED = 4  # networks
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
-
-Run = Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]
-"""From the encoded inputs, (C, h, w) each, to the head, (h, w, C)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,8 +257,9 @@ class LearnedRefiner:
         candidates = None if candidates is None else _extended_each(candidates * np.float32(2), below, beside)
         rule = self._file.rule
         inputs = encode(tuple(network.inputs), rule.unit_inputs, disparity, image, confidence, candidates)
-        head = self._compiled.run(inputs, threads)
-        return rule.map(head, disparity, rows, columns, threads, candidates)
+        finish = partial(rule.map, coarse=disparity, rows=rows, columns=columns, threads=threads, candidates=candidates)
+        full: NDArray[np.float32] = self._compiled.run(inputs, threads, finish)
+        return full
 
     def _check_trained(self, disparity: NDArray[np.float32], shift: float) -> None:
         """Warn, once, where a map in half-size pixels, lowered by `shift`, goes beyond what was trained."""
@@ -287,9 +289,11 @@ class LearnedRefiner:
         gaps = bool(unknown.any())
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
-        values = hypotheses(disparity, coarse.candidates, left, right, step, threads)
-        inputs = {"evidence": network_input(values, coarse.confidence, left, columns, threads)}
-        full, sure = mixture(self._compiled.run(inputs, threads), values, rows, columns, threads)
+        with self._compiled.workspaces(rows, columns, step).take() as workspace:
+            values = hypotheses(disparity, coarse.candidates, left, right, step, threads, workspace)
+            inputs = {"evidence": network_input(values, coarse.confidence, left, columns, threads, workspace)}
+            finish = partial(mixture, found=values, rows=rows, columns=columns, threads=threads)
+            full, sure = self._compiled.run(inputs, threads, finish)
         known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
         if gaps:
             missing = enlarged(unknown.view(np.uint8), step, rows, columns).astype(bool)
@@ -453,6 +457,7 @@ class _Compiled:
     def __init__(self, content: WeightFile, backend: str, precision: str) -> None:
         self.content, self.backend, self.precision = content, backend, precision
         self._runs: OrderedDict[tuple[int, int, int], Run] = OrderedDict()
+        self._pools: OrderedDict[tuple[int, ...], Pool[Workspace]] = OrderedDict()
         self._lock = threading.Lock()
         self.warned = False
 
@@ -462,8 +467,10 @@ class _Compiled:
             if not self._runs:
                 self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
 
-    def run(self, inputs: dict[str, NDArray[Any]], threads: int) -> NDArray[np.float32]:
-        """Return the head for encoded inputs."""
+    def run(
+        self, inputs: dict[str, NDArray[Any]], threads: int, use: Callable[[NDArray[np.float32]], Any] = np.array
+    ) -> Any:
+        """Return what `use` makes of the head for encoded inputs; see `stereokit_refiners.runtimes.contract.Run`."""
         rows, columns = next(iter(inputs.values())).shape[1:]
         key = (rows, columns, threads)
         self.settle()
@@ -474,4 +481,13 @@ class _Compiled:
             self._runs[key] = runner
             while len(self._runs) > _MOST_COMPILED:
                 self._runs.popitem(last=False)
-        return runner(inputs)
+        return runner(inputs, use)
+
+    def workspaces(self, *size: int) -> Pool[Workspace]:
+        """Return the buffers for maps of a size."""
+        with self._lock:
+            pool = self._pools.pop(size, None) or Pool(Workspace)
+            self._pools[size] = pool
+            while len(self._pools) > _MOST_COMPILED:
+                self._pools.popitem(last=False)
+        return pool

@@ -16,8 +16,9 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import sys
 from collections.abc import Callable, Iterable
-from functools import wraps
+from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,7 +38,7 @@ CHECKED = os.environ.get("STEREOKIT_CHECKED", "0") not in ("", "0")
 
 
 _ROOT = Path(__file__).parents[1]
-_IMPORT = re.compile(rb"^ *from (stereokit[.\w]*) import +(\([^)]*\)|[^\n]*)", re.MULTILINE)
+_IMPORT = re.compile(rb"^ *from (\w[.\w]*) +import +(\([^)]*\)|[^\n]*)", re.MULTILINE)
 
 
 def _digest(paths: Iterable[Path]) -> str:
@@ -47,30 +48,51 @@ def _digest(paths: Iterable[Path]) -> str:
     return digest.hexdigest()[:12]
 
 
-def _imports(path: Path) -> set[Path]:
-    """Return the modules of the package that a module imports; a line that names nothing of it adds nothing."""
+def _folder(package: str) -> Path | None:
+    """Return the folder of a package that is being imported, or None for what is none."""
+    if package == _ROOT.name:
+        return _ROOT
+    places = getattr(sys.modules.get(package), "__path__", ())
+    return next((Path(place) for place in places), None)
+
+
+def _imports(path: Path, folders: Iterable[Path]) -> set[Path]:
+    """Return the modules in these folders of packages that a module imports; what names nothing of them adds none."""
     files: set[Path] = set()
+    roots = {folder.name: folder for folder in folders}
     for module, names in _IMPORT.findall(path.read_bytes()):
-        place = _ROOT.joinpath(*module.decode().split(".")[1:])
-        inner = [place / name for name in re.findall(r"\w+", names.decode())]
-        files |= {file for each in (place, *inner) for file in (each.with_suffix(".py"), each / "__init__.py")}
+        package, *inner = module.decode().split(".")
+        if package in roots:
+            place = roots[package].joinpath(*inner)
+            places = [place, *(place / name for name in re.findall(r"\w+", names.decode()))]
+            files |= {file for each in places for file in (each.with_suffix(".py"), each / "__init__.py")}
     return {file for file in files if file.is_file()}
 
 
-def kernel_sources() -> set[Path]:
-    """Return the modules that compiled code may depend on: those that use `stereokit.kernels`, and their imports."""
+def kernel_sources(package: str = _ROOT.name) -> set[Path]:
+    """Return the modules that compiled code of a package may depend on.
+
+    They are those that use `stereokit.kernels`, and what they import of the package and of this one.
+    """
+    folder = _folder(package)
+    folders = {_ROOT} if folder is None else {_ROOT, folder}
     sources: set[Path] = set()
-    waiting = {path for path in _ROOT.rglob("*.py") if b"stereokit.kernels.jit" in path.read_bytes()}
+    modules = set() if folder is None else set(folder.rglob("*.py"))
+    waiting = {path for path in modules if b"stereokit.kernels.jit" in path.read_bytes()}
     while waiting:
         sources |= waiting
-        waiting = set().union(*map(_imports, waiting)) - sources
+        waiting = set().union(*(_imports(path, folders) for path in waiting)) - sources
     return sources
 
 
 FINGERPRINT = _digest(_ROOT.rglob("*.py"))
 """A digest of the package's source: it changes with anything that a result may depend on."""
 
-_STAMP = _digest(kernel_sources())
+
+@lru_cache
+def _stamp(package: str) -> str:
+    """Return a digest of what kernels of a package may depend on; of one module alone numba looks at that itself."""
+    return _digest(kernel_sources(_ROOT.name) | kernel_sources(package))
 
 
 # Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
@@ -84,7 +106,7 @@ _FLAGS: dict[str, Any] = {
 
 def kernel(function: F) -> F:
     """Compile `function` as a kernel that Python code calls."""
-    function.__qualname__ = f"{function.__qualname__}_{_STAMP}"
+    function.__qualname__ = f"{function.__qualname__}_{_stamp(function.__module__.partition('.')[0])}"
     compiled: F = numba.njit(**_FLAGS)(function)
     if hasattr(compiled, "_cache"):  # not where NUMBA_DISABLE_JIT is set
         compiled._cache = cache_of(function)

@@ -15,7 +15,8 @@ from stereokit_refiners import weights
 from stereokit_refiners.learned import EvidenceRefiner
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, STEPS, Evidence
 from stereokit_refiners.networks.layers import shapes
-from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.evidence import hypotheses
+from stereokit_refiners.runtimes.features import network_input
 from stereokit_refiners.runtimes.mixture import mixture
 from stereokit_refiners.weights import WeightFile
 

@@ -11,7 +11,8 @@ pytest.importorskip("safetensors")
 
 from stereokit.errors import OptionError  # noqa: E402
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS  # noqa: E402
-from stereokit_refiners.runtimes.evidence import hypotheses, network_input  # noqa: E402
+from stereokit_refiners.runtimes.evidence import hypotheses  # noqa: E402
+from stereokit_refiners.runtimes.features import network_input  # noqa: E402
 from stereokit_refiners.runtimes.mixture import mixture as compiled_mixture  # noqa: E402
 from stereokit_refiners.training import evidence as training  # noqa: E402
 from stereokit_refiners.weights import read  # noqa: E402

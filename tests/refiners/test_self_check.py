@@ -42,7 +42,8 @@ def broken(monkeypatch):
             run = real(content, backend, precision, *rest)
             if backend not in names and f"{backend} {precision}" not in names:
                 return run
-            return lambda inputs: run(inputs) + np.float32(0.5)  # a head counts in steps of 4 pixels
+            # A head counts in steps of 4 pixels.
+            return lambda inputs, use=np.array: run(inputs, lambda head: use(head + np.float32(0.5)))
 
         monkeypatch.setattr(learned, "_compile", compile_)
 

@@ -193,3 +193,33 @@ def test_names_of_kernels_change_with_what_is_compiled_and_nothing_else():
     simd = {f"kernels/simd/{name}.py" for name in ("__init__", "types", "memory", "arithmetic", "shuffle")}
     assert simd | {"images/check.py"} <= sources  # imported by these
     assert not sources & {"matching.py", "calibration.py", "cli/match.py", "result.py"}
+
+
+def test_kernels_of_another_package_change_with_its_helpers_and_constants(tmp_path, monkeypatch):
+    """Numba looks at the file of the kernel itself; what is compiled into it may stand in others."""
+    package = tmp_path / "others"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "constants.py").write_text("FACTOR = 3\n")
+    helper = "from stereokit.kernels.jit import inline\n@inline\ndef times(x):\n    return {} * x\n"
+    (package / "helpers.py").write_text(helper.format(2))
+    (package / "unused.py").write_text("UNUSED = 1\n")
+    (package / "kernels.py").write_text(
+        "from stereokit.kernels.jit import kernel\nfrom others.constants import FACTOR\n"
+        "from others.helpers import times\n@kernel\ndef triple(x):\n    return FACTOR * times(x)\n"
+    )
+    call = "from others.kernels import triple; print(triple(7), triple.__qualname__)"
+
+    def run():
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        done = subprocess.run([sys.executable, "-c", call], env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.split()
+
+    first = run()
+    assert first[0] == "42" and run() == first
+    (package / "unused.py").write_text("UNUSED = 2\n")
+    assert run() == first
+    (package / "helpers.py").write_text(helper.format(5))
+    assert run()[0] == "105"
+    (package / "constants.py").write_text("FACTOR = 1\n")
+    assert run()[0] == "35"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit_refiners.networks.layers import Network, Weights, output_rule, sub_pixel_kernel
+from stereokit_refiners.runtimes.contract import Run
 from stereokit_refiners.runtimes.onnx_file import Node, model_bytes
 
 __all__ = ["head_graph", "map_graph", "session"]
@@ -152,10 +153,8 @@ def map_graph(network: Network, weights: Weights, output_mode: str) -> bytes:
     return _model(ops, "disparity", inputs, full, [1, 1, "2h", "2w"])
 
 
-def session(
-    network: Network, weights: Weights, threads: int
-) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
-    """Return a function from (C, h, w) inputs to the (h, w, C) head that ONNX Runtime computes."""
+def session(network: Network, weights: Weights, threads: int) -> Run:
+    """Return the network as ONNX Runtime computes it."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -165,8 +164,8 @@ def session(
     graph = head_graph(network, weights)
     model = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
-    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]], use: Callable[[NDArray[np.float32]], Any] = np.array) -> Any:
         feeds = {name: np.ascontiguousarray(inputs[name][None], np.float32) for name in network.inputs}
-        return np.ascontiguousarray(model.run(["head"], feeds)[0][0])
+        return use(np.ascontiguousarray(model.run(["head"], feeds)[0][0]))
 
     return run

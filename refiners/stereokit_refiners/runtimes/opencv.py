@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from stereokit.kernels.workspace import Pool
 from stereokit_refiners.networks.layers import Network, Weights
+from stereokit_refiners.runtimes.contract import Run
 from stereokit_refiners.runtimes.onnx import head_graph
 
 __all__ = ["compiled", "opencv_threads"]
@@ -56,10 +57,8 @@ def opencv_threads(count: int) -> Iterator[None]:
                 cv2.setNumThreads(_threads.before)
 
 
-def compiled(
-    network: Network, weights: Weights, rows: int, columns: int, threads: int
-) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
-    """Compile for a size; return a function from (C, h, w) inputs to the (h, w, C) head, safe to call in parallel."""
+def compiled(network: Network, weights: Weights, rows: int, columns: int, threads: int) -> Run:
+    """Compile for a size."""
     model = np.frombuffer(head_graph(network, weights, rows, columns), np.uint8)
 
     def loaded() -> Any:
@@ -69,10 +68,10 @@ def compiled(
 
     nets: Pool[Any] = Pool(loaded)
 
-    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]], use: Callable[[NDArray[np.float32]], Any] = np.array) -> Any:
         with nets.take() as net, opencv_threads(threads):
             for name in network.inputs:
                 net.setInput(np.ascontiguousarray(inputs[name][None], np.float32), name)
-            return np.array(net.forward()[0], np.float32)
+            return use(net.forward()[0])
 
     return run

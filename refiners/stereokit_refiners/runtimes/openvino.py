@@ -32,6 +32,7 @@ from openvino import opset13 as op
 from stereokit.kernels.threads import available_threads
 from stereokit.kernels.workspace import Pool
 from stereokit_refiners.networks.layers import Layer, Network, Weights, sub_pixel_kernel
+from stereokit_refiners.runtimes.contract import Run
 
 __all__ = ["build", "compiled"]
 
@@ -206,8 +207,8 @@ def _core() -> ov.Core:
 def compiled(
     network: Network, weights: Weights, rows: int, columns: int, threads: int, precision: str,
     ranges: Ranges | None,
-) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:  # fmt: skip
-    """Compile for a size; return a function from (C, h, w) inputs to the (h, w, C) head, safe to call in parallel.
+) -> Run:  # fmt: skip
+    """Compile for a size.
 
     With one thread a call, as many calls run side by side as there are processors; with more, one call uses them all.
     """
@@ -230,7 +231,7 @@ def compiled(
 
     requests: Pool[Any] = Pool(request)
 
-    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]], use: Callable[[NDArray[np.float32]], Any] = np.array) -> Any:
         with requests.take() as free:
             if network.innermost:
                 for k, name in enumerate(network.inputs):
@@ -242,6 +243,6 @@ def compiled(
                 free.infer()
             else:
                 free.infer([inputs[name][None] for name in network.inputs], share_inputs=True)
-            return np.array(free.get_output_tensor().data[0])
+            return use(free.get_output_tensor().data[0])
 
     return run

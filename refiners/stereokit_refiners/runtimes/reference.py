@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereokit_refiners.networks.layers import Network, Weights, output_rule, sub_pixel_kernel
+from stereokit_refiners.runtimes.contract import Run
 from stereokit_refiners.runtimes.encode import encode
-from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.evidence import hypotheses
+from stereokit_refiners.runtimes.features import network_input
 from stereokit_refiners.runtimes.mixture import mixture
 from stereokit_refiners.weights import WeightFile, network_named
 
@@ -148,16 +150,16 @@ def _prepared(content: WeightFile) -> tuple[dict[str, NDArray[Any]], Callable[[A
     return inputs, lambda head: mixture(head, values, rows, columns)[0]
 
 
-def mistake(content: WeightFile, run: Callable[[dict[str, NDArray[Any]]], Array]) -> float:
+def mistake(content: WeightFile, run: Run) -> float:
     """Return how far a runtime's map of a small scene is off on average, full-size pixels; infinite if not a number.
 
     Parameters
     ----------
     content : WeightFile
-    run : callable
-        The network, compiled for inputs of `input_size`: from the encoded inputs to the (h, w, C) head.
+    run : Run
+        The network, compiled for inputs of `input_size`.
     """
     inputs, finish = _prepared(content)
     right = forward(network_named(content.network), content.arrays, inputs)
-    off = float(np.abs(finish(run(inputs)) - finish(right)).mean())
+    off = float(np.abs(run(inputs, finish) - finish(right)).mean())
     return off if np.isfinite(off) else float("inf")

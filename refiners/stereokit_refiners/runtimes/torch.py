@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from stereokit_refiners.networks.layers import Layer, Network, sub_pixel_taps
+from stereokit_refiners.runtimes.contract import Run
 
 __all__ = ["Module", "calibrate", "runner"]
 
@@ -132,20 +133,18 @@ def _sub_pixel(weight: Tensor) -> Tensor:
     return kernel.reshape(4 * outputs, inputs, 3, 3)
 
 
-def runner(
-    network: Network, arrays: Mapping[str, NDArray[np.float32]]
-) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.float32]]:
-    """Return a function from (C, h, w) inputs to the (h, w, C) head, on the GPU if torch has one."""
+def runner(network: Network, arrays: Mapping[str, NDArray[np.float32]]) -> Run:
+    """Return the network, on the GPU if torch has one."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     module = Module(network)
     module.load(arrays)
     module.to(device, memory_format=torch.channels_last).eval().requires_grad_(False)  # type: ignore[call-overload]
 
-    def run(inputs: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+    def run(inputs: dict[str, NDArray[Any]], use: Callable[[NDArray[np.float32]], Any] = np.array) -> Any:
         with torch.inference_mode():
             tensors = {name: torch.from_numpy(inputs[name])[None].to(device).float() for name in network.inputs}
             head = module(tensors)["map"][0].permute(1, 2, 0)
-            return np.ascontiguousarray(head.cpu().numpy())
+            return use(np.ascontiguousarray(head.cpu().numpy()))
 
     return run
 

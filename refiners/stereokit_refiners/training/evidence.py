@@ -30,7 +30,8 @@ import stereokit
 from stereokit.errors import OptionError
 from stereokit.result import Disparity
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, STEPS, WINDOWS, Evidence
-from stereokit_refiners.runtimes.evidence import hypotheses, network_input
+from stereokit_refiners.runtimes.evidence import hypotheses
+from stereokit_refiners.runtimes.features import network_input
 from stereokit_refiners.runtimes.torch import Module, calibrate
 from stereokit_refiners.weights import WeightFile, read, write
 

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from stereokit.costs.rows import CostInput, Levels, Search, takes_8_bits
 from stereokit.errors import OptionError
 from stereokit.images.blank import blank_pixels
+from stereokit.images.blur import smooth
 from stereokit.images.evidence import joined
 from stereokit.images.gray import GrayPair
 from stereokit.images.intensity import scale_guide
-from stereokit.images.resize import half_size, reduced, smooth
+from stereokit.images.resize import half_size, reduced
 from stereokit.kernels.simd import LANES
 from stereokit.kernels.trace import span
 from stereokit.kernels.workspace import Pool, Workspace

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from stereokit.costs.rows import Cost, CostInput, Levels, VolumeRows, produce_volume, takes_8_bits
 from stereokit.errors import InputError, OptionError
+from stereokit.images.blur import smooth as smoothed
 from stereokit.images.check import check_integer, check_nodata, check_number, writable
 from stereokit.images.gray import gray_pair
 from stereokit.images.maps import numbers
-from stereokit.images.resize import smooth as smoothed
 from stereokit.kernels.threads import available_threads
 from stereokit.kernels.workspace import Workspace
 from stereokit.methods import build_aggregation, build_cost, check_levels, current_names

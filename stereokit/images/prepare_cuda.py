@@ -1,20 +1,18 @@
 """CUDA twins of the preparation of images: grey, half size, Gaussian blur; and the ranges of values.
 
-All are integers and equal `stereokit.images.gray` and `stereokit.images.resize` to the last bit. OpenCV makes grey
-with 15-bit weights, rounds the mean of four pixels half up, and blurs 16-bit images with 16-bit weights and one
-rounding at the end. The weights come from OpenCV itself: it blurs an impulse.
+All are integers and equal `stereokit.images.gray`, `stereokit.images.resize` and `stereokit.images.blur` to the last
+bit. OpenCV makes grey with 15-bit weights, rounds the mean of four pixels half up, and blurs 16-bit images with 16-bit
+weights and one rounding at the end. The weights come from OpenCV itself: it blurs an impulse.
 
 The two images of a pair lie behind one another in one array, ``(2, H, W)`` flat, so that each stage is one launch.
 """
 
 from __future__ import annotations
 
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from stereokit.cuda.kernel import (
     Kernel,
@@ -32,12 +30,12 @@ from stereokit.cuda.kernel import (
     u32,
     u64,
 )
+from stereokit.images.blur import gaussian_weights
 
 __all__ = [
     "KINDS",
     "clamped",
     "flip",
-    "gaussian_weights",
     "halve",
     "ranges",
     "smooth",
@@ -217,25 +215,6 @@ for _dtype in KINDS:
     halve_kernel(_dtype)
     blur_rows_kernel(_dtype)
     ranges_kernel(_dtype)
-
-
-@lru_cache(maxsize=64)
-def gaussian_weights(sigma: float) -> NDArray[np.uint32]:
-    """Return the weights of OpenCV's Gaussian of 16-bit images, in units of 2**-16; they sum to one.
-
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation in pixels, above 0.
-    """
-    reach = int(8 * sigma) + 4  # OpenCV's window is about 8 sigma wide
-    impulse = np.zeros((1, 2 * reach + 1), np.uint16)
-    impulse[0, reach] = 65535
-    spread = cv2.GaussianBlur(np.repeat(impulse, 3, axis=0), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)[1]
-    half = reach - int(np.flatnonzero(spread)[0])
-    weights: NDArray[np.uint32] = spread[reach - half : reach + half + 1].astype(np.uint32)
-    weights[half] = 65536 - (int(weights.sum()) - int(weights[half]))
-    return weights
 
 
 def take(

@@ -1,4 +1,4 @@
-"""The preparation of a grey pair: half size, and a Gaussian blur."""
+"""A grey pair at half size."""
 
 from __future__ import annotations
 
@@ -6,69 +6,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stereokit.images.gray import GrayPair
-from stereokit.images.intensity import scale_guide
 from stereokit.kernels.jit import kernel
-from stereokit.kernels.threads import run, run_stages, spans
-from stereokit.kernels.workspace import Workspace
+from stereokit.kernels.threads import run, spans
 
-__all__ = ["half_size", "reduced", "reduced_mask", "smooth"]
-
-
-def smooth(
-    pair: GrayPair, sigma: float, workspace: Workspace | None = None, threads: int = 1, *, eight_bits: bool = False
-) -> GrayPair:
-    """Return the pair with both images smoothed by a Gaussian; the guide stays as sharp as it was.
-
-    The result is 16 bit, so that nothing is lost to rounding: 8-bit images are multiplied by 256 first. For costs that
-    take 8 bits only, it is rounded to 8 bits in the end, and images of 16 bits are brought to 256 levels first.
-
-    Parameters
-    ----------
-    pair : GrayPair
-    sigma : float
-        Standard deviation in pixels; 0 returns the pair itself.
-    workspace : Workspace or None
-        The owner of the buffers of the smoothed images, which the next call overwrites; None makes new ones.
-    threads : int
-        Threads to use.
-    eight_bits : bool
-        Whether the result is of 8 bits, for pairs of 16 bits too.
-    """
-    if eight_bits and pair.left.dtype != np.uint8:
-        left, right = scale_guide(pair.left, *pair.span), scale_guide(pair.right, *pair.span)
-        pair = replace(pair, left=left, right=right, ranges=None, span=(0, 65535))
-    if sigma == 0:
-        return pair
-    buffers = workspace or Workspace()
-    images = pair.left, pair.right
-    height = images[0].shape[0]
-    bands = spans(height, -(-threads // 2))
-    deep, blurred = ([buffers.array(f"smooth.{name}{k}", images[0].shape, np.uint16) for k in (0, 1)] for name in "wb")
-    reach = int(np.ceil(4 * sigma)) + 1  # of the kernel that OpenCV takes, at most
-
-    def deepen(k: int, y0: int, y1: int) -> None:
-        np.multiply(images[k][y0:y1], np.uint16(256), out=deep[k][y0:y1])
-
-    def blur(k: int, y0: int, y1: int) -> None:
-        """Smooth a band of rows: with more rows than it has, so that those are like in the whole."""
-        first, behind = max(y0 - reach, 0), min(y1 + reach, height)
-        image = (deep[k] if images[k].dtype == np.uint8 else images[k])[first:behind]
-        if len(bands) == 1:
-            cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred[k], borderType=cv2.BORDER_REPLICATE)
-            return
-        band = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-        blurred[k][y0:y1] = band.reshape(image.shape)[y0 - first : y1 - first]
-
-    parts = [(k, *band) for band in bands for k in (0, 1)]
-    deepened = [partial(deepen, *part) for part in parts] if images[0].dtype == np.uint8 else []
-    run_stages([deepened, [partial(blur, *part) for part in parts]], threads)
-    left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)
-    return replace(pair, left=left, right=right)
+__all__ = ["half_size", "reduced", "reduced_mask"]
 
 
 def reduced(pair: GrayPair, step: int, threads: int = 1) -> GrayPair:

@@ -24,15 +24,16 @@ from numpy.typing import NDArray
 
 from stereokit.kernels.jit import inline, kernel
 
-__all__ = ["WORDS_APART", "claim", "publish", "spin_while", "wait_until"]
+__all__ = ["LOOKS_AWAKE", "WORDS_APART", "claim", "publish", "spin_while", "wait_until"]
 
 WORDS_APART = 8
 """Elements of int64 from one word to the next that another thread writes: they share no cache line."""
 
 _BUSY_LOOKS = 256
 """Looks, each some tens of nanoseconds, before the processor is offered to others between looks."""
-_LOOKS_AWAKE = 300
-"""Looks before the first sleep between two: some tens of microseconds where nobody else wants the processor."""
+LOOKS_AWAKE = 300
+"""Looks before the first sleep between two: some tens of microseconds where nobody else wants the processor. A sleep may
+last three times as long as it is asked to."""
 _SLEEPS = 60
 """Sleeps of `spin_while`, some milliseconds in all."""
 _SLEEP_MICROSECONDS = 50
@@ -106,21 +107,24 @@ def _sleep(typing: Any, microseconds: Any) -> Any:
 
 
 @inline
-def _wait(looks: int) -> None:
+def _wait(looks: int, awake: int) -> None:
     """Wait for a moment after so many looks."""
-    if looks < _LOOKS_AWAKE:
+    if looks < awake:
         _pause(looks)
     else:
         _sleep(_SLEEP_MICROSECONDS)
 
 
 @kernel
-def spin_while(words: NDArray[Any], index: int, value: int) -> bool:
-    """Wait while element `index` of the int64 `words` has this value; return False if it still has it at the end."""
-    for looks in range(_LOOKS_AWAKE + _SLEEPS):
+def spin_while(words: NDArray[Any], index: int, value: int, awake: int) -> bool:
+    """Wait while element `index` of the int64 `words` has this value; return False if it still has it at the end.
+
+    It looks so many times without sleeping between looks.
+    """
+    for looks in range(awake + _SLEEPS):
         if _look(words, index) != value:
             return True
-        _wait(looks)
+        _wait(looks, awake)
     return False
 
 
@@ -129,5 +133,5 @@ def wait_until(words: NDArray[Any], index: int, value: int) -> None:
     """Wait until element `index` of the int64 `words` is at least `value`."""
     looks = 0
     while _look(words, index) < value:
-        _wait(looks)
+        _wait(looks, LOOKS_AWAKE)
         looks += 1

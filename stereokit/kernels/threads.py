@@ -29,7 +29,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from stereokit.kernels.spin import spin_while
+from stereokit.kernels.spin import LOOKS_AWAKE, spin_while
 from stereokit.kernels.trace import runner
 
 __all__ = ["Job", "Team", "Workers", "available_threads", "run", "run_stages", "spans", "team"]
@@ -39,6 +39,9 @@ Task = Callable[[], object]
 
 _IDLE_SECONDS = 60.0
 """Time after which a worker without work ends."""
+_LOOKS_OF_TWO = 10_000
+"""Looks without sleep, some milliseconds, of one who waits for the only other member of a team. More members together
+look no longer, for the processor's time."""
 _NAP_SECONDS = 50e-6
 """Sleep between two looks at a helper that is long at its task; signals get in meanwhile."""
 
@@ -205,6 +208,7 @@ class Team:
         # The first word is the number of stages so far, the others say what each helper does. Each has one writer at
         # a time: the caller that of an absent helper, the helper its own.
         self._words = np.zeros(min(threads, 1 + _workers.limit), np.int64)
+        self._awake = max(LOOKS_AWAKE, _LOOKS_OF_TWO // max(1, len(self._words) - 1) ** 2)
         self._stage = _Stage()
 
     def run(self, stages: Sequence[Sequence[Task]]) -> None:
@@ -232,7 +236,7 @@ class Team:
     def _wait(self) -> None:
         """Wait for helpers that are at a task; one that comes later finds none."""
         for k in range(1, len(self._words)):
-            while not spin_while(self._words, k, _BUSY):
+            while not spin_while(self._words, k, _BUSY, self._awake):
                 time.sleep(_NAP_SECONDS)
 
     def _help(self, k: int) -> None:
@@ -240,7 +244,7 @@ class Team:
         words = self._words
         seen = 0
         try:
-            while spin_while(words, 0, seen):
+            while spin_while(words, 0, seen, self._awake):
                 seen = int(words[0])
                 if seen == _CLOSED:
                     break

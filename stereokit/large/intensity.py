@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereokit.images.blur import smooth
 from stereokit.images.evidence import joined, neutral, unusable
 from stereokit.images.gray import GrayPair, gray_of
 from stereokit.images.intensity import IntensityMapping, find_mapping
-from stereokit.images.resize import reduced, smooth
+from stereokit.images.resize import reduced
 from stereokit.large.border import BlackBorder
 from stereokit.large.sources import Source
 

@@ -46,7 +46,7 @@ def _by_types(choose: Any) -> Any:
     return lambda *arguments: choose(*map(_kind_of, arguments))(*arguments)
 
 
-def _spin_while(words: Any, index: int, value: int) -> bool:
+def _spin_while(words: Any, index: int, value: int, awake: int) -> bool:
     for _ in range(1000):
         if words[index] != value:
             return True

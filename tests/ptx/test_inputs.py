@@ -8,7 +8,7 @@ import pytest
 
 from ptx.checks import inputs as checks
 from ptx.interpreter.emulated import EmulatedQueue
-from stereokit.images.prepare_cuda import gaussian_weights
+from stereokit.images.blur import gaussian_weights
 
 SEEDS = [None, 1, 2, 3]
 TYPES = [np.uint8, np.uint16]

@@ -11,8 +11,9 @@ from stereokit import Matcher
 from stereokit.aggregation.sgm import Sgm
 from stereokit.costs.rows import CostInput, Levels, implements
 from stereokit.errors import OptionError
+from stereokit.images.blur import smooth
 from stereokit.images.gray import gray_pair
-from stereokit.images.resize import half_size, smooth
+from stereokit.images.resize import half_size
 from stereokit.kernels import threads as workers
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.spin import WORDS_APART, claim, publish, wait_until

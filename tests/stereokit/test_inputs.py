@@ -10,9 +10,10 @@ import pytest
 
 import stereokit
 from stereokit import InputError, Matcher, OptionError, StereokitError, UnknownNameError, match
+from stereokit.images.blur import smooth
 from stereokit.images.gray import gray_pair
 from stereokit.images.intensity import to_gray
-from stereokit.images.resize import half_size, smooth
+from stereokit.images.resize import half_size
 
 METHOD = "census+sgm"
 KEEP_ALL = {"fill": None, "smp": False, "speckle": 0, "uniqueness": 0, "median": 0}

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stereokit_refiners.networks.layers import Network, Weights, output_rule, sub_pixel_kernel
 from stereokit_refiners.runtimes.contract import Run
 from stereokit_refiners.runtimes.onnx_file import Node, model_bytes
+from stereokit_refiners.runtimes.planes import planar
 
 __all__ = ["head_graph", "map_graph", "session"]
 
@@ -165,7 +166,7 @@ def session(network: Network, weights: Weights, threads: int) -> Run:
     model = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
     def run(inputs: dict[str, NDArray[Any]], use: Callable[[NDArray[np.float32]], Any] = np.array) -> Any:
-        feeds = {name: np.ascontiguousarray(inputs[name][None], np.float32) for name in network.inputs}
+        feeds = {name: planar(inputs[name], threads) for name in network.inputs}
         return use(np.ascontiguousarray(model.run(["head"], feeds)[0][0]))
 
     return run

@@ -19,6 +19,7 @@ from stereokit.kernels.workspace import Pool
 from stereokit_refiners.networks.layers import Network, Weights
 from stereokit_refiners.runtimes.contract import Run
 from stereokit_refiners.runtimes.onnx import head_graph
+from stereokit_refiners.runtimes.planes import planar
 
 __all__ = ["compiled", "opencv_threads"]
 
@@ -71,7 +72,7 @@ def compiled(network: Network, weights: Weights, rows: int, columns: int, thread
     def run(inputs: dict[str, NDArray[Any]], use: Callable[[NDArray[np.float32]], Any] = np.array) -> Any:
         with nets.take() as net, opencv_threads(threads):
             for name in network.inputs:
-                net.setInput(np.ascontiguousarray(inputs[name][None], np.float32), name)
+                net.setInput(planar(inputs[name], threads), name)
             return use(net.forward()[0])
 
     return run

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import DeviceError, OptionError, StereokitError
+from stereokit.errors import OptionError, StereokitError
 from stereokit.notices import warn
 from stereokit.postprocess import fill
 from stereokit.registry import REFINERS
@@ -183,10 +183,7 @@ class LearnedRefiner:
             Once, if disparities beyond those of the training remain.
         """
         step = round(1 / scale)
-        wanted = (-(-left.shape[0] // step), -(-left.shape[1] // step))
-        if coarse.disparity.shape != wanted:
-            size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
-            raise OptionError(f"coarse map must be {size} size of left {left.shape}, got {coarse.disparity.shape}")
+        _check_size(coarse.disparity, left, step)
         if self.any_scale:
             return self._weighed(coarse, left, right, step, threads)
         rows, columns = left.shape
@@ -277,18 +274,14 @@ class LearnedRefiner:
     ) -> Disparity:
         """Return the map of a network that weighs values by evidence from both images."""
         rows, columns = left.shape
-        if right is None or right.shape != left.shape:
-            got = "none" if right is None else right.shape
-            raise OptionError(f"right must have the size of left {left.shape} for this refiner, got {got}")
-        if coarse.confidence is None or coarse.candidates is None:
-            raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+        candidates, confidence, other = _evidence_of(coarse, left, right)
         disparity = coarse.disparity
         unknown = np.isnan(disparity)
         gaps = bool(unknown.any())
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
-        values = hypotheses(disparity, coarse.candidates, left, right, step, threads)
-        inputs = {"evidence": network_input(values, coarse.confidence, left, columns, threads)}
+        values = hypotheses(disparity, candidates, left, other, step, threads)
+        inputs = {"evidence": network_input(values, confidence, left, columns, threads)}
         full, sure = mixture(self._compiled.run(inputs, threads), values, rows, columns, threads)
         known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
         if gaps:
@@ -297,11 +290,18 @@ class LearnedRefiner:
             known &= ~missing
         return Disparity(full, known, sure)
 
-    def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+    def on_device(
+        self, coarse: DeviceDisparity, left: Any, stream: Any, *, right: Any = None, scale: float = 0.5
+    ) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
-        if self.needs_right:
-            raise DeviceError(f"refiner {self._file.network!r} does not work on the device yet: match host images")
-        maps: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
+        maps: tuple[Any, Any, Any]
+        if self.any_scale:
+            step = round(1 / scale)
+            _check_size(coarse.disparity, left, step)
+            _evidence_of(coarse, left, right)
+            maps = on_tensors("evidence_tensors").weigh_on_device(self._file, coarse, left, right, step, stream)
+        else:
+            maps = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return maps
 
 
@@ -337,6 +337,26 @@ class PyramidRefiner(LearnedRefiner):
 def learned_names() -> list[str]:
     """Return the names of the registered refiners that are networks."""
     return [name for name in REFINERS.names() if getattr(REFINERS.get(name), "architecture", "")]
+
+
+def _check_size(disparity: Any, left: Any, step: int) -> None:
+    """Raise OptionError unless a coarse map has the size that goes with the image's."""
+    rows, columns = left.shape
+    if tuple(disparity.shape) != (-(-rows // step), -(-columns // step)):
+        size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
+        raise OptionError(
+            f"coarse map must be {size} size of left {tuple(left.shape)}, got {tuple(disparity.shape)}"
+        )
+
+
+def _evidence_of(coarse: Disparity | DeviceDisparity, left: Any, right: Any) -> tuple[Any, Any, Any]:
+    """Return candidates, confidence and the right image; OptionError where one is missing or has another size."""
+    if right is None or tuple(right.shape) != tuple(left.shape):
+        got = "none" if right is None else tuple(right.shape)
+        raise OptionError(f"right must have the size of left {tuple(left.shape)} for this refiner, got {got}")
+    if coarse.confidence is None or coarse.candidates is None:
+        raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+    return coarse.candidates, coarse.confidence, right
 
 
 def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:

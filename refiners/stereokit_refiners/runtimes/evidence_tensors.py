@@ -4,9 +4,10 @@
 integers and floats, bit for bit. `mixture` is that of `stereokit_refiners.runtimes.mixture` but for its exponentials,
 and the network runs in fp32. Nothing is copied to the host, no shape depends on the values, and nothing is waited for.
 
-Eager torch computes one IEEE operation at a time, so that no product and sum become one operation. Two of its forms
-are avoided: on a GPU a division by a Python number is a product with its reciprocal, and so is one of a number by a
-tensor. Sums of floats are written out, because reductions have an order of their own.
+Eager torch computes one IEEE operation at a time, so that no product and sum become one operation. Three of its forms
+are avoided: on a GPU a division by a Python number is a product with its reciprocal, and everywhere so is one of a
+number by a tensor; on a processor a square root may be wrong in its last bit, but not as a float64 that is rounded.
+Sums of floats are written out, because reductions have an order of their own.
 """
 
 from __future__ import annotations
@@ -278,7 +279,7 @@ def _averages(image: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     grey = image.int()
     sums = torch.stack([_blocks(plane[None], 4).sum(0, dtype=torch.int32) for plane in (grey, grey * grey)])
     mean, square = _window_sum(sums.float() * (1 / 16), 4) * (1 / 81)
-    spread = torch.sqrt((square - mean * mean).clamp(min=0))
+    spread = (square - mean * mean).clamp(min=0).double().sqrt().float()
     relief = _window_sum((_sum_by_two(half) * 0.25)[None], 8)[0] * (1 / 289)
     return mean, torch.full_like(spread, STEPS) / (spread + 3), relief
 

@@ -90,7 +90,8 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
         full = _refine(settings, coarse, pair, settings.scale, threads)
     disparity = full.disparity
     if settings.bounds is not None:
-        disparity = np.clip(disparity, *np.float32(settings.bounds))
+        low, high = settings.bounds
+        disparity = np.clip(disparity, np.float32(low), np.float32(high))
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 

@@ -75,10 +75,10 @@ class DeviceRefiner(Protocol):
     """Brings a map to full size on the GPU, without a copy to the host.
 
     It is called with what the attributes of its refiner ask for, as `Refiner` is. With ``needs_right`` that is also
-    ``right=``, the right grey image at full size, (H, W) uint8 on the device. With ``any_scale`` that is also ``scale=``,
-    1, 0.5 or 0.25, which is left out where it is 0.5 and the right image is not asked for. The matcher holds the map of
-    a refiner with ``needs_right`` to its range. It is called once for one view: a GPU searches in full, so that there
-    is no smaller map to refine before.
+    ``right=``, the right grey image at full size, (H, W) uint8 on the device. With ``any_scale`` that is also
+    ``scale=``, 1, 0.5 or 0.25, which is left out where it is 0.5 and the right image is not asked for. The matcher
+    holds the map of a refiner with ``needs_right`` to its range. It is called once for one view: a GPU searches in
+    full, so that there is no smaller map to refine before.
     """
 
     def __call__(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:

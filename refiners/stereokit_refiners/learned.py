@@ -344,9 +344,7 @@ def _check_size(disparity: Any, left: Any, step: int) -> None:
     rows, columns = left.shape
     if tuple(disparity.shape) != (-(-rows // step), -(-columns // step)):
         size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
-        raise OptionError(
-            f"coarse map must be {size} size of left {tuple(left.shape)}, got {tuple(disparity.shape)}"
-        )
+        raise OptionError(f"coarse map must be {size} size of left {tuple(left.shape)}, got {tuple(disparity.shape)}")
 
 
 def _evidence_of(coarse: Disparity | DeviceDisparity, left: Any, right: Any) -> tuple[Any, Any, Any]:

@@ -184,7 +184,7 @@ def test_what_the_general_refiner_needs_on_the_device():
 
 
 def test_tensor_refiners_are_for_half_size_maps():
-    rule = "^refiner must be one that sees a half-size map alone, got 'evidence', which Matcher.on_device runs on a GPU$"
+    rule = "^refiner must be one that sees a half-size map alone, got 'evidence', which Matcher.on_device runs on a GPU"
     with pytest.raises(OptionError, match=rule):
         TensorRefiner("evidence", "cpu")
 

@@ -1,8 +1,8 @@
 """Refining torch tensors where they are: on a GPU, without a copy to the host.
 
-`TensorRefiner` is `LearnedRefiner` in torch from end to end (scaling, network, upsampling). It takes tensors, or
-anything that torch can view without a copy, such as the device arrays of numba or CuPy
-(``__cuda_array_interface__``).
+`TensorRefiner` is `LearnedRefiner` of half-size maps in torch from end to end (scaling, network, upsampling). It takes
+tensors, or anything that torch can view without a copy, such as the device arrays of numba or CuPy
+(``__cuda_array_interface__``). `stereokit_refiners.runtimes.evidence_tensors` is the general refiner.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class TensorRefiner:
     Parameters
     ----------
     refiner : str or WeightFile
-        A name ("stereovae", "cnn", "pyramid"), the path of a ``.safetensors`` file, or its content.
+        A name ("stereovae", "cnn", "pyramid"), the path of a ``.safetensors`` file, or its content. The general refiner
+        sees both images: see `stereokit_refiners.runtimes.evidence_tensors`.
     device : str
         Where to compute: "cuda", "cuda:1", "cpu".
     weights : str or None
@@ -54,7 +55,7 @@ class TensorRefiner:
     Raises
     ------
     OptionError
-        If torch has no such device.
+        If torch has no such device, or the network sees more than a half-size map and the left image.
     FileError
         If the weights cannot be used.
     """

@@ -9,8 +9,8 @@ import numpy as np
 from stereokit.kernels.workspace import Workspace
 from stereokit.postprocess import fill, median, remove_speckles, single_matching_phase
 from stereokit.postprocess.chain import PostProcessing, post_process
-from stereokit.postprocess.chain_cuda import post_process as post_process_cuda
 from stereokit.postprocess.chain_cuda import hold
+from stereokit.postprocess.chain_cuda import post_process as post_process_cuda
 from stereokit.postprocess.fill_cuda import fill as fill_cuda
 from stereokit.postprocess.median_cuda import median as median_cuda
 from stereokit.postprocess.smp_cuda import resolve

@@ -224,13 +224,11 @@ class Matcher:
         InputError
             If the images cannot be used.
         DeviceError
-            If the matcher's device is not "cuda", the refiner of half size works on the host only or `fill` is None
-            there, or the device is short of memory.
+            If the matcher's device is not "cuda", there is a refiner and it works on the host only or `fill` is None,
+            or the device is short of memory.
         """
         if isinstance(self._pipeline, CpuPipeline):
             raise DeviceError("device must be 'cuda' for images on the device, got 'cpu'")
-        if self.scale == 1 and self.refiner is not None:
-            raise DeviceError(f"refiner must be None for images on the device with scale=1, got {self.refiner!r}")
         if self.settings.nodata is not None:
             raise DeviceError(f"nodata must be None for images on the device, got {self.settings.nodata:g}")
         pipeline: Any = self._pipeline

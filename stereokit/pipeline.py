@@ -90,11 +90,9 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     with span("refine", "refine"):
         full = _refine(settings, coarse, pair, settings.scale, threads)
     disparity = full.disparity
-    if getattr(settings.refiner, "needs_right", False):  # it measures for itself, and may leave the range
-        levels = settings.levels
-        disparity = np.clip(disparity, np.float32(levels.minimum), np.float32(levels.minimum + levels.count - 1))
-    elif settings.floor is not None:
-        disparity = np.maximum(disparity, np.float32(settings.floor))
+    if settings.bounds is not None:
+        low, high = settings.bounds
+        disparity = np.clip(disparity, np.float32(low), np.float32(high))
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 

@@ -239,10 +239,16 @@ class MatchSettings:
         return across, down
 
     @property
-    def floor(self) -> int | None:
-        """The minimum, where the levels of a smaller size begin below it: refined maps are raised to it."""
-        below = self.step * self.matched_levels.minimum < self.levels.minimum
-        return self.levels.minimum if below else None
+    def bounds(self) -> tuple[float, float] | None:
+        """The smallest and the largest disparity that a refined map is held to; None where it lies within by itself.
+
+        A refiner that looks at the right image measures for itself, and may leave the range. Other maps may only lie
+        below, where the levels of a smaller size begin below.
+        """
+        low = self.levels.minimum
+        if getattr(self.refiner, "needs_right", False):
+            return float(low), float(low + self.levels.count - 1)
+        return (float(low), np.inf) if self.step * self.matched_levels.minimum < low else None
 
     @property
     def detail(self) -> Detail:

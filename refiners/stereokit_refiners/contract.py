@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["DeviceRefiner", "Refiner", "on_tensors"]
 
 
-def on_tensors() -> Any:
-    """Return the module `stereokit_refiners.runtimes.tensors`.
+def on_tensors(module: str = "tensors") -> Any:
+    """Return the module `stereokit_refiners.runtimes.tensors`, or another of that folder that needs torch.
 
     Raises
     ------
@@ -29,7 +29,7 @@ def on_tensors() -> Any:
         If torch is not installed.
     """
     try:
-        return import_module("stereokit_refiners.runtimes.tensors")
+        return import_module(f"stereokit_refiners.runtimes.{module}")
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
@@ -72,7 +72,14 @@ class Refiner(Protocol):
 
 
 class DeviceRefiner(Protocol):
-    """Brings a half-size map to full size on the GPU, without a copy to the host."""
+    """Brings a map to full size on the GPU, without a copy to the host.
+
+    It is called with what the attributes of its refiner ask for, as `Refiner` is. With ``needs_right`` that is also
+    ``right=``, the right grey image at full size, (H, W) uint8 on the device. With ``any_scale`` that is also
+    ``scale=``, 1, 0.5 or 0.25, which is left out where it is 0.5 and the right image is not asked for. The matcher
+    holds the map of a refiner with ``needs_right`` to its range. It is called once for one view: a GPU searches in
+    full, so that there is no smaller map to refine before.
+    """
 
     def __call__(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
         """Return the full-size disparity, what of it was measured, and the confidence.
@@ -82,8 +89,9 @@ class DeviceRefiner(Protocol):
         Parameters
         ----------
         coarse : stereokit.cuda.pipeline.DeviceDisparity, (ceil(H/2), ceil(W/2))
-            Map of the half-size pair in half-size pixels, dense. Arrays with ``__cuda_array_interface__`` that the
-            matcher will write over after what is on the stream.
+            Map of the half-size pair in half-size pixels, dense; with another `scale`, rows and columns are those of
+            `left` times that, rounded up. Arrays with ``__cuda_array_interface__`` that the matcher will write over
+            after what is on the stream.
         left : (H, W) uint8
             Left grey image at full size, on the device too.
         stream : numba stream

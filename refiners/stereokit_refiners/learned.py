@@ -1,20 +1,8 @@
-"""Learned refiners: a network's weights behind the contract of `stereokit_refiners.contract`.
-
-The runtime is what is installed: OpenVINO first, then ONNX Runtime, then torch, and OpenCV, which always is. The
-precision is what the processor is fast at: int8 where it has the instructions and the weights were calibrated, else
-bfloat16, else fp32.
-Before a process trusts a runtime with a network, it compares a small map with that of plain numpy
-(`stereokit_refiners.runtimes.reference`), and takes another runtime, with a warning, if they disagree. Networks
-compiled for a size are kept, a few at a time.
-"""
+"""Learned refiners: a network's weights behind the contract of `stereokit_refiners.contract`."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import threading
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,28 +11,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import DeviceError, OptionError, StereokitError
-from stereokit.kernels.workspace import Pool, Workspace
+from stereokit.errors import OptionError
 from stereokit.notices import warn
 from stereokit.postprocess import fill
 from stereokit.registry import REFINERS
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
 from stereokit_refiners.linear import doubled, enlarged
-from stereokit_refiners.runtimes.contract import Run
+from stereokit_refiners.runtimes.choice import CompiledNetwork, backend_named, precision_named
 from stereokit_refiners.runtimes.encode import base_of, encode
 from stereokit_refiners.runtimes.evidence import hypotheses
 from stereokit_refiners.runtimes.features import network_input
 from stereokit_refiners.runtimes.mixture import mixture
-from stereokit_refiners.runtimes.reference import TOLERANCES_PX, input_size, mistake
 from stereokit_refiners.weights import WeightFile, find, network_named
 
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
 
 __all__ = [
-    "BACKENDS",
-    "PRECISIONS",
     "CnnRefiner",
     "EvidenceRefiner",
     "LearnedRefiner",
@@ -53,10 +37,6 @@ __all__ = [
     "learned_names",
 ]
 
-BACKENDS = ("openvino", "onnxruntime", "torch", "opencv")
-"""The fastest first; the last comes with the base package."""
-PRECISIONS = ("fp32", "bf16", "int8")
-_MOST_COMPILED = 4  # networks
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
 
 
@@ -91,7 +71,7 @@ class LearnedRefiner:
     needs_weights: ClassVar[bool] = True
     """Whether `weights` must be given, because none come with the package."""
     _file: WeightFile = field(init=False, repr=False, compare=False)
-    _compiled: _Compiled = field(init=False, repr=False, compare=False)
+    _compiled: CompiledNetwork = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.weights is None and not self.architecture:
@@ -111,9 +91,9 @@ class LearnedRefiner:
 
     def _use(self, content: WeightFile) -> None:
         object.__setattr__(self, "_file", content)
-        object.__setattr__(self, "backend", _backend(self.backend))
-        object.__setattr__(self, "precision", _precision(self.precision, self.backend, content))
-        object.__setattr__(self, "_compiled", _Compiled(content, self.backend, self.precision))
+        object.__setattr__(self, "backend", backend_named(self.backend))
+        object.__setattr__(self, "precision", precision_named(self.precision, self.backend, content))
+        object.__setattr__(self, "_compiled", CompiledNetwork(content, self.backend, self.precision))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, LearnedRefiner) and self.fingerprint == other.fingerprint
@@ -184,10 +164,7 @@ class LearnedRefiner:
             Once, if disparities beyond those of the training remain.
         """
         step = round(1 / scale)
-        wanted = (-(-left.shape[0] // step), -(-left.shape[1] // step))
-        if coarse.disparity.shape != wanted:
-            size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
-            raise OptionError(f"coarse map must be {size} size of left {left.shape}, got {coarse.disparity.shape}")
+        _check_size(coarse.disparity, left, step)
         if self.any_scale:
             return self._weighed(coarse, left, right, step, threads)
         rows, columns = left.shape
@@ -279,19 +256,15 @@ class LearnedRefiner:
     ) -> Disparity:
         """Return the map of a network that weighs values by evidence from both images."""
         rows, columns = left.shape
-        if right is None or right.shape != left.shape:
-            got = "none" if right is None else right.shape
-            raise OptionError(f"right must have the size of left {left.shape} for this refiner, got {got}")
-        if coarse.confidence is None or coarse.candidates is None:
-            raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+        candidates, confidence, other = _evidence_of(coarse, left, right)
         disparity = coarse.disparity
         unknown = np.isnan(disparity)
         gaps = bool(unknown.any())
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
         with self._compiled.workspaces(rows, columns, step).take() as workspace:
-            values = hypotheses(disparity, coarse.candidates, left, right, step, threads, workspace)
-            inputs = {"evidence": network_input(values, coarse.confidence, left, columns, threads, workspace)}
+            values = hypotheses(disparity, candidates, left, other, step, threads, workspace)
+            inputs = {"evidence": network_input(values, confidence, left, columns, threads, workspace)}
             finish = partial(mixture, found=values, rows=rows, columns=columns, threads=threads)
             full, sure = self._compiled.run(inputs, threads, finish)
         known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).astype(bool)
@@ -301,11 +274,18 @@ class LearnedRefiner:
             known &= ~missing
         return Disparity(full, known, sure)
 
-    def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+    def on_device(
+        self, coarse: DeviceDisparity, left: Any, stream: Any, *, right: Any = None, scale: float = 0.5
+    ) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
-        if self.needs_right:
-            raise DeviceError(f"refiner {self._file.network!r} does not work on the device yet: match host images")
-        maps: tuple[Any, Any, Any] = on_tensors().refine_on_device(self._file, coarse, left, stream)
+        maps: tuple[Any, Any, Any]
+        if self.any_scale:
+            step = round(1 / scale)
+            _check_size(coarse.disparity, left, step)
+            _evidence_of(coarse, left, right)
+            maps = on_tensors("evidence_tensors").weigh_on_device(self._file, coarse, left, right, step, stream)
+        else:
+            maps = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return maps
 
 
@@ -343,6 +323,24 @@ def learned_names() -> list[str]:
     return [name for name in REFINERS.names() if getattr(REFINERS.get(name), "architecture", "")]
 
 
+def _check_size(disparity: Any, left: Any, step: int) -> None:
+    """Raise OptionError unless a coarse map has the size that goes with the image's."""
+    rows, columns = left.shape
+    if tuple(disparity.shape) != (-(-rows // step), -(-columns // step)):
+        size = {1: "the", 2: "half the", 4: "a quarter of the"}[step]
+        raise OptionError(f"coarse map must be {size} size of left {tuple(left.shape)}, got {tuple(disparity.shape)}")
+
+
+def _evidence_of(coarse: Disparity | DeviceDisparity, left: Any, right: Any) -> tuple[Any, Any, Any]:
+    """Return candidates, confidence and the right image; OptionError where one is missing or has another size."""
+    if right is None or tuple(right.shape) != tuple(left.shape):
+        got = "none" if right is None else tuple(right.shape)
+        raise OptionError(f"right must have the size of left {tuple(left.shape)} for this refiner, got {got}")
+    if coarse.confidence is None or coarse.candidates is None:
+        raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
+    return coarse.candidates, coarse.confidence, right
+
+
 def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:
     if below == 0 and beside == 0:
         return np.ascontiguousarray(image)
@@ -351,143 +349,3 @@ def _extended(image: NDArray[Any], below: int, beside: int) -> NDArray[Any]:
 
 def _extended_each(maps: NDArray[np.float32], below: int, beside: int) -> NDArray[np.float32]:
     return maps if below == 0 and beside == 0 else np.stack([_extended(one, below, beside) for one in maps])
-
-
-def _installed() -> list[str]:
-    """Return the runtimes that are there, the best first."""
-    installed = [name for name in BACKENDS[:-1] if importlib.util.find_spec(name) is not None]
-    return [*installed, "opencv"] if hasattr(cv2, "dnn") else installed
-
-
-def _backend(name: str) -> str:
-    if name != "auto" and name not in BACKENDS:
-        raise OptionError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
-    installed = _installed()
-    if name == "auto":
-        if not installed:
-            raise StereokitError(
-                "learned refiners need OpenCV's dnn, which this build lacks, or another runtime: pip install "
-                "'stereokit[refiners]', or 'stereokit[onnx]' where OpenVINO has no wheel"
-            )
-        return installed[0]
-    if name not in installed:
-        way = {"openvino": "'stereokit[refiners]'", "onnxruntime": "'stereokit[onnx]'", "torch": "'stereokit[train]'"}
-        raise StereokitError(
-            f"backend {name!r} is not installed: pip install {way.get(name, 'opencv-python-headless')}"
-        )
-    return name
-
-
-def _precision(name: str, backend: str, content: WeightFile) -> str:
-    if name != "auto" and name not in PRECISIONS:
-        raise OptionError(f"precision must be one of auto, {', '.join(PRECISIONS)}, got {name!r}")
-    if backend != "openvino":
-        if name not in ("auto", "fp32"):
-            raise OptionError(f"precision must be fp32 with backend {backend!r}, got {name!r}")
-        return "fp32"
-    if name == "int8" and not content.ranges:
-        raise OptionError("precision must not be int8 with weights that were not calibrated for it")
-    if name != "auto":
-        return name
-    from llvmlite import binding
-
-    features = binding.get_host_cpu_features()
-    if content.ranges and features.get("avx2"):  # with VNNI or without, faster than fp32
-        return "int8"
-    return "bf16" if features.get("avx512bf16") or features.get("amx-bf16") else "fp32"
-
-
-_sound: dict[tuple[str, str, str], tuple[str, str]] = {}
-_sound_lock = threading.Lock()
-
-
-def _sound_way(content: WeightFile, backend: str, precision: str) -> tuple[str, str]:
-    """Return the backend and precision to run a network with: those given, if they compute it rightly here.
-
-    Checked once a process for each network, with the weights that come first.
-
-    Raises
-    ------
-    StereokitError
-        If no runtime that is installed does.
-    """
-    key = content.network, backend, precision
-    with _sound_lock:
-        if key not in _sound:
-            wrong = []
-            ways = [(backend, precision), *((b, "fp32") for b in _installed() if (b, "fp32") != (backend, precision))]
-            for way in ways:
-                off = mistake(content, _compile(content, *way, *input_size(content), 1))
-                if off <= TOLERANCES_PX[way[1]]:
-                    break
-                wrong.append(f"{way[0]} in {way[1]} is off by {off:.3g} px on average")
-            else:
-                reasons = "; ".join(wrong)
-                raise StereokitError(f"no runtime here computes network {content.network!r} rightly: {reasons}")
-            if wrong:
-                line = f"network {content.network!r} is run by {way[0]} in {way[1]}, since on this machine "
-                warn(line + "; ".join(wrong))
-            _sound[key] = way
-        return _sound[key]
-
-
-def _compile(content: WeightFile, backend: str, precision: str, rows: int, columns: int, threads: int) -> Run:
-    network = network_named(content.network)
-    if backend == "openvino":
-        from stereokit_refiners.runtimes.openvino import compiled
-
-        ranges = content.ranges if precision == "int8" else None
-        return compiled(network, content.arrays, rows, columns, threads, precision, ranges)
-    if backend == "onnxruntime":
-        from stereokit_refiners.runtimes.onnx import session
-
-        return session(network, content.arrays, threads)
-    if backend == "opencv":
-        from stereokit_refiners.runtimes.opencv import compiled as compiled_by_opencv
-
-        return compiled_by_opencv(network, content.arrays, rows, columns, threads)
-    from stereokit_refiners.runtimes.torch import runner
-
-    return runner(network, content.arrays)
-
-
-class _Compiled:
-    """The compiled networks of one refiner, by size and threads; `backend` and `precision` are what runs them."""
-
-    def __init__(self, content: WeightFile, backend: str, precision: str) -> None:
-        self.content, self.backend, self.precision = content, backend, precision
-        self._runs: OrderedDict[tuple[int, int, int], Run] = OrderedDict()
-        self._pools: OrderedDict[tuple[int, ...], Pool[Workspace]] = OrderedDict()
-        self._lock = threading.Lock()
-        self.warned = False
-
-    def settle(self) -> None:
-        """Take the backend and precision that compute the network rightly here."""
-        with self._lock:
-            if not self._runs:
-                self.backend, self.precision = _sound_way(self.content, self.backend, self.precision)
-
-    def run(
-        self, inputs: dict[str, NDArray[Any]], threads: int, use: Callable[[NDArray[np.float32]], Any] = np.array
-    ) -> Any:
-        """Return what `use` makes of the head for encoded inputs; see `stereokit_refiners.runtimes.contract.Run`."""
-        rows, columns = next(iter(inputs.values())).shape[1:]
-        key = (rows, columns, threads)
-        self.settle()
-        with self._lock:
-            runner = self._runs.pop(key, None) or _compile(
-                self.content, self.backend, self.precision, rows, columns, threads
-            )
-            self._runs[key] = runner
-            while len(self._runs) > _MOST_COMPILED:
-                self._runs.popitem(last=False)
-        return runner(inputs, use)
-
-    def workspaces(self, *size: int) -> Pool[Workspace]:
-        """Return the buffers for maps of a size."""
-        with self._lock:
-            pool = self._pools.pop(size, None) or Pool(Workspace)
-            self._pools[size] = pool
-            while len(self._pools) > _MOST_COMPILED:
-                self._pools.popitem(last=False)
-        return pool

@@ -46,9 +46,11 @@ class Linear:
             confidence[~valid] = 0
         return Disparity(disparity, valid, confidence)
 
-    def on_device(self, coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Any, Any, Any]:
+    def on_device(
+        self, coarse: DeviceDisparity, left: Any, stream: Any, *, scale: float = 0.5
+    ) -> tuple[Any, Any, Any]:  # fmt: skip
         """Return the map at the size of `left`, on the GPU; see `stereokit_refiners.contract.DeviceRefiner`."""
-        maps: tuple[Any, Any, Any] = on_tensors().linear_on_device(coarse, left, stream)
+        maps: tuple[Any, Any, Any] = on_tensors().linear_on_device(coarse, left, stream, round(1 / scale))
         return maps
 
 

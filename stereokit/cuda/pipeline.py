@@ -27,7 +27,7 @@ from stereokit.images.prepare_cuda import flip, halve, smooth, take
 from stereokit.images.resize import reduced_mask
 from stereokit.kernels.workspace import Pool
 from stereokit.pipeline import refined
-from stereokit.postprocess.chain_cuda import post_process, raise_to
+from stereokit.postprocess.chain_cuda import hold, post_process
 from stereokit.registry import AGGREGATIONS, COSTS
 from stereokit.result import Disparity
 from stereokit.selection.wta_cuda import Maps, zero_invalid_confidence
@@ -204,13 +204,13 @@ class CudaPipeline:
         InputError
             If the images cannot be used.
         DeviceError
-            If matching is at half size with a refiner that works on the host only, or memory is short.
+            If the refiner works on the host only or gets a map that is not filled, or memory is short.
         """
-        half = self.settings.scale != 1
-        if half and self._refine is None:
+        refines = self.settings.refiner is not None
+        if refines and getattr(self.settings.refiner, "on_device", None) is None:
             raise DeviceError("refiner must be one with on_device for images on the device: linear, or a learned one")
-        if half and self.settings.fill is None:
-            raise DeviceError("fill must not be None for images on the device at half size: refiners need dense maps")
+        if refines and self.settings.fill is None:
+            raise DeviceError("fill must not be None for images on the device with a refiner, which needs a dense map")
         views = _from_device("left", left), _from_device("right", right)
         if views[0].shape != views[1].shape:
             raise InputError(f"left and right must have the same size, got {views[0].shape} and {views[1].shape}")
@@ -218,7 +218,7 @@ class CudaPipeline:
         stream = cuda.default_stream() if stream is None else stream_of(stream)
         with self._queue(stream) as queue:
             maps = self._match_views(queue, views, False, stream)
-            if not half:  # what refiners return is new
+            if not refines:  # what refiners return is new
                 maps = _DeviceMaps(*(None if part is None else _reshaped(queue.copy(part), shape) for part in maps))
             other = None
             if self.settings.right:
@@ -230,24 +230,33 @@ class CudaPipeline:
         return DeviceDisparity(maps.disparity, maps.valid, confidence, other)
 
     def _match_views(self, queue: Queue, views: tuple[_Image, ...], mirrored: bool, stream: Any) -> _DeviceMaps:
-        """Match two images on the device, or what a camera behind a mirror sees of them; at half size, refine."""
+        """Match two images on the device, or what a camera behind a mirror sees of them, and refine."""
         shape, dtype = views[0].shape, views[0].dtype
         pixels = shape[0] * shape[1]
         images = queue.array("images", 2 * pixels, dtype)
         for place, image in enumerate(views):
             take(queue, image.pixels, dtype, images, place, image.channels, mirrored, shape)
         maps, size = self.run(queue, images, dtype, images[:pixels], None, shape)
-        if self.settings.scale != 1:
-            disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in maps[:3])
-            two = None if maps.candidates is None else _reshaped(maps.candidates, (2, *size))
-            coarse = DeviceDisparity(disparity, valid, sure, candidates=two)
-            full = _DeviceMaps(*self._refine(coarse, _reshaped(images[:pixels], shape), stream))
-            if self.settings.floor is None:
-                return full
-            raised = _flat(full.disparity)
-            queue.launch(raise_to, blocks_for(pixels, raise_to.block), raised, self.settings.floor, pixels)
-            return full._replace(disparity=_reshaped(raised, shape))
-        return maps
+        if self.settings.refiner is None:
+            return maps
+        disparity, valid, sure = (None if part is None else _reshaped(part, size) for part in maps[:3])
+        two = None if maps.candidates is None else _reshaped(maps.candidates, (2, *size))
+        coarse = DeviceDisparity(disparity, valid, sure, candidates=two)
+        left, right = (_reshaped(part, shape) for part in (images[:pixels], images[pixels:]))
+        full = self._refined(coarse, left, right, stream)
+        if self.settings.bounds is None:
+            return full
+        within = _flat(full.disparity)
+        queue.launch(hold, blocks_for(pixels, hold.block), within, *self.settings.bounds, pixels)
+        return full._replace(disparity=_reshaped(within, shape))
+
+    def _refined(self, coarse: DeviceDisparity, left: Any, right: Any, stream: Any) -> _DeviceMaps:
+        """Return what the refiner makes of a map: `stereokit_refiners.contract.DeviceRefiner`."""
+        refiner: Any = self.settings.refiner
+        keywords: dict[str, Any] = {"right": right} if getattr(refiner, "needs_right", False) else {}
+        if getattr(refiner, "any_scale", False) and (keywords or self.settings.scale != 0.5):
+            keywords["scale"] = self.settings.scale
+        return _DeviceMaps(*refiner.on_device(coarse, left, stream, **keywords))
 
     @contextmanager
     def _queue(self, stream: Any) -> Iterator[Any]:
@@ -331,11 +340,6 @@ class CudaPipeline:
         volume = self._cost.volume(queue, cost, pair)
         shape = pair.height, pair.width
         self._aggregation.aggregate(queue, aggregation, cost, volume, guide, shape, pair.padded, maps)
-
-    @property
-    def _refine(self) -> Any:
-        """The refiner on the device, `stereokit_refiners.contract.DeviceRefiner`, or None."""
-        return getattr(self.settings.refiner, "on_device", None)
 
 
 def _floats(aggregation: Any) -> bool:

@@ -32,8 +32,8 @@ WORDS_APART = 8
 _BUSY_LOOKS = 256
 """Looks, each some tens of nanoseconds, before the processor is offered to others between looks."""
 LOOKS_AWAKE = 300
-"""Looks before the first sleep between two: some tens of microseconds where nobody else wants the processor. A sleep may
-last three times as long as it is asked to."""
+"""Looks before the first sleep between two: some tens of microseconds where nobody else wants the processor. A sleep
+may last three times as long as it is asked to."""
 _SLEEPS = 60
 """Sleeps of `spin_while`, some milliseconds in all."""
 _SLEEP_MICROSECONDS = 50

@@ -13,7 +13,7 @@ from stereokit.postprocess.median_cuda import median
 from stereokit.postprocess.smp_cuda import resolve
 from stereokit.postprocess.speckle_cuda import remove
 
-__all__ = ["post_process", "raise_to"]
+__all__ = ["hold", "post_process"]
 
 
 @kernel(array(f32), array(u8), u32)
@@ -24,12 +24,16 @@ def invalidate(disparity, bad, pixels):  # type: ignore[no-untyped-def]
         disparity[at] = f32(np.nan)
 
 
-@kernel(array(f32), f32, u32)
-def raise_to(disparity, low, pixels):  # type: ignore[no-untyped-def]
-    """Raise what lies below the lowest disparity to it; NaN stays."""
+@kernel(array(f32), f32, f32, u32)
+def hold(disparity, low, high, pixels):  # type: ignore[no-untyped-def]
+    """Raise what lies below the lowest disparity to it, lower what lies above the highest; NaN stays."""
     at = u32(cuda.grid(1))
-    if at < pixels and disparity[at] < low:
-        disparity[at] = low
+    if at < pixels:
+        value = disparity[at]
+        if value < low:
+            disparity[at] = low
+        elif value > high:
+            disparity[at] = high
 
 
 def post_process(

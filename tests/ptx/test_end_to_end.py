@@ -218,16 +218,103 @@ def test_nothing_lies_below_an_odd_minimum_at_half_size(host_as_device, low):
         np.testing.assert_allclose(getattr(result, name), getattr(want, name), rtol=0, atol=2e-3)
 
 
-def test_refiners_of_the_host_are_not_for_the_device(queues, monkeypatch):
+@pytest.mark.parametrize(("refiner", "scale"), [("stereokit", 1), ("stereokit", 0.5), ("auto", 1), ("auto", 0.5)])
+def test_the_general_refiner_on_the_device(host_as_device, refiner, scale):
+    pytest.importorskip("torch")
+    pair = _pair(17, 41)
+    low = -3 if refiner == "stereokit" else 0
+    options = {**LEVELS, "min_disparity": low, "scale": scale, "right": True, "confidence": True}
+    want = Matcher("S2", device="cpu", refiner=refiner, backend="torch", **options)(*pair)
+    result = Matcher("S2", device="cuda", refiner=refiner, **options).on_device(*pair, stream=0)
+    for name in ("disparity", "right"):
+        np.testing.assert_allclose(getattr(result, name), getattr(want, name), rtol=0, atol=1e-3)
+    np.testing.assert_array_equal(np.asarray(result.valid) != 0, want.valid)
+    np.testing.assert_allclose(result.confidence, want.confidence, rtol=0, atol=1e-4)
+    plain = Matcher("S2", device="cpu", refiner="linear", **options)(*pair)
+    assert np.abs(want.disparity - plain.disparity).max() > 0.02 < np.abs(want.right - plain.right).max()
+
+
+def test_a_gpu_refines_no_map_that_says_where_to_search(host_as_device):
+    pytest.importorskip("torch")
+    pair = _pair(17, 41)
+    options = {"max_disparity": 64, "refiner": "stereokit", "backend": "torch", "threads": 1}
+    assert Matcher("S2", device="cpu", **options).settings.refines_search
+    want = Matcher("S2", device="cpu", search="full", **options)(*pair)
+    result = Matcher("S2", device="cuda", **options).on_device(*pair, stream=0)
+    np.testing.assert_allclose(result.disparity, want.disparity, rtol=0, atol=1e-3)
+
+
+def test_auto_upscales_small_images_linearly_on_the_device(host_as_device):
+    pytest.importorskip("torch")
+    pair = _pair(9, 27)
+    for scale in (1, 0.5):
+        maps = [
+            Matcher("S2", device="cuda", scale=scale, refiner=refiner, **LEVELS).on_device(*pair, stream=0)
+            for refiner in ("auto", "linear")
+        ]
+        np.testing.assert_array_equal(*(result.disparity for result in maps))
+        want = Matcher("S2", device="cpu", scale=scale, refiner="linear", **LEVELS)(*pair)
+        np.testing.assert_array_equal(maps[1].disparity, want.disparity)
+
+
+class _DeviceRecorder:
+    """A refiner on the device that records its calls, and returns a ramp from -100 to 100."""
+
+    def __init__(self, **attributes: Any) -> None:
+        self.calls: list[tuple[Any, Any, dict[str, Any]]] = []
+        vars(self).update(attributes)
+
+    def __call__(self, coarse: Any, left: Any, *, threads: int = 1, **keywords: Any) -> Any:
+        raise AssertionError
+
+    def on_device(self, coarse: Any, left: Any, stream: Any, **keywords: Any) -> Any:
+        self.calls.append((coarse, left.copy(), {name: np.copy(value) for name, value in keywords.items()}))
+        values = np.linspace(-100, 100, left.size, dtype=np.float32).reshape(left.shape)
+        return values, np.ones(left.shape, np.uint8), None
+
+
+@pytest.mark.parametrize("scale", [1, 0.5])
+def test_refiners_on_the_device_get_what_they_ask_for(host_as_device, scale):
+    left, right = _pair(9, 27)
+    refiner = _DeviceRecorder(needs_right=True, any_scale=True, needs_candidates=True)
+    options = {"min_disparity": -5, "max_disparity": 9, "scale": scale, "right": True, "threads": 1}
+    result = Matcher("S2", device="cuda", refiner=refiner, **options).on_device(left, right, stream=0)
+    views = (left, right), (right[:, ::-1], left[:, ::-1])  # the second as a camera behind a mirror sees them
+    assert len(refiner.calls) == 2
+    for (coarse, one, keywords), pair in zip(refiner.calls, views, strict=True):
+        np.testing.assert_array_equal(one, pair[0])
+        np.testing.assert_array_equal(keywords.pop("right"), pair[1])
+        assert keywords == {"scale": scale}
+        shape = tuple(round(side * scale + 0.1) for side in (9, 27))
+        assert coarse.disparity.shape == coarse.confidence.shape == shape and coarse.candidates.shape == (2, *shape)
+    for disparity in (result.disparity, result.right):  # held to the range of the levels
+        assert (disparity.min(), disparity.max()) == (-5, 8)
+    np.testing.assert_array_equal(result.right, result.disparity[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("attributes", "scale", "keywords"),
+    [({}, 0.5, {}), ({"any_scale": True}, 0.5, {}), ({"any_scale": True}, 1, {"scale": 1})],
+)
+def test_other_refiners_on_the_device_are_called_with_the_left_image_alone(host_as_device, attributes, scale, keywords):
+    refiner = _DeviceRecorder(**attributes)
+    result = Matcher("S2", device="cuda", refiner=refiner, scale=scale, **LEVELS).on_device(*_pair(9, 27), stream=0)
+    assert [call[2] for call in refiner.calls] == [keywords]
+    assert (result.disparity.min(), result.disparity.max()) == (-100, 100)
+
+
+@pytest.mark.parametrize("scale", [1, 0.5])
+def test_refiners_of_the_host_are_not_for_the_device(queues, monkeypatch, scale):
     pair = _pair(9, 27)
     monkeypatch.delattr(Linear, "on_device")
     with pytest.raises(DeviceError, match="refiner must be one with on_device for images on the device"):
-        Matcher("S2", device="cuda", scale=0.5).on_device(*pair)
+        Matcher("S2", device="cuda", scale=scale, refiner="linear").on_device(*pair)
 
 
-def test_gaps_are_not_refined_on_the_device(queues):
-    with pytest.raises(DeviceError, match="fill must not be None for images on the device at half size"):
-        Matcher("S2", device="cuda", scale=0.5, fill=None).on_device(*_pair(9, 27))
+@pytest.mark.parametrize("scale", [1, 0.5])
+def test_gaps_are_not_refined_on_the_device(queues, scale):
+    with pytest.raises(DeviceError, match="fill must not be None for images on the device with a refiner"):
+        Matcher("S2", device="cuda", scale=scale, refiner="linear", fill=None).on_device(*_pair(9, 27))
 
 
 def test_images_of_the_device_must_be_what_kernels_take(queues):

@@ -10,10 +10,10 @@ from refining import coarse_of, image_of
 
 import stereokit
 from stereokit.errors import OptionError, StereokitError, StereokitWarning
-from stereokit_refiners import learned
 from stereokit_refiners.auto import SMALLEST, AutoRefiner
 from stereokit_refiners.learned import EvidenceRefiner
 from stereokit_refiners.linear import Linear
+from stereokit_refiners.runtimes import choice
 
 
 def maps_of(refiner, size, scale=0.5):
@@ -34,8 +34,8 @@ def test_it_is_the_general_one_but_for_small_images(size, scale):
 
 
 def test_it_is_linear_with_one_warning_where_nothing_computes_the_network_rightly(monkeypatch):
-    monkeypatch.setattr(learned, "_sound", {})
-    monkeypatch.setattr(learned, "mistake", lambda *arguments: 5.0)
+    monkeypatch.setattr(choice, "_sound", {})
+    monkeypatch.setattr(choice, "mistake", lambda *arguments: 5.0)
     with pytest.warns(StereokitWarning, match=r"^refiner 'auto' is linear: no runtime here computes") as messages:
         refiner = AutoRefiner()
     assert len(messages) == 1 and refiner.general is None and not refiner.needs_right and not refiner.needs_candidates
@@ -45,7 +45,7 @@ def test_it_is_linear_with_one_warning_where_nothing_computes_the_network_rightl
 
 
 def test_it_is_linear_where_no_runtime_is_installed(monkeypatch):
-    monkeypatch.setattr(learned, "_installed", list)
+    monkeypatch.setattr(choice, "_installed", list)
     with pytest.warns(StereokitWarning, match=r"^refiner 'auto' is linear: learned refiners need"):
         assert AutoRefiner().general is None
 

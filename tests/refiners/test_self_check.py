@@ -18,9 +18,8 @@ from refining import (
 )
 
 from stereokit.errors import StereokitError, StereokitWarning
-from stereokit_refiners import learned
 from stereokit_refiners.learned import LearnedRefiner
-from stereokit_refiners.runtimes import reference
+from stereokit_refiners.runtimes import choice, reference
 from stereokit_refiners.weights import NETWORKS
 
 SIZE = (32, 48)
@@ -29,13 +28,13 @@ SIZE = (32, 48)
 @pytest.fixture(autouse=True)
 def untrusted(monkeypatch):
     """Let no runtime be trusted yet."""
-    monkeypatch.setattr(learned, "_sound", {})
+    monkeypatch.setattr(choice, "_sound", {})
 
 
 @pytest.fixture
 def broken(monkeypatch):
     """Return a function that breaks runtimes: their maps are off by two pixels."""
-    real = learned._compile
+    real = choice._compile
 
     def of(*names):
         def compile_(content, backend, precision, *rest):
@@ -45,7 +44,7 @@ def broken(monkeypatch):
             # A head counts in steps of 4 pixels.
             return lambda inputs, use=np.array: run(inputs, lambda head: use(head + np.float32(0.5)))
 
-        monkeypatch.setattr(learned, "_compile", compile_)
+        monkeypatch.setattr(choice, "_compile", compile_)
 
     return of
 
@@ -72,13 +71,13 @@ def test_plain_numpy_is_torchs_network(name):
 def test_networks_tuned_to_kitti_pass_with_room(name, precision):
     content = tuned_to_kitti(name)
     for backend in LEARNED if precision == "fp32" else {"openvino"} & set(LEARNED):
-        run = learned._compile(content, backend, precision, *reference.input_size(content), 1)
+        run = choice._compile(content, backend, precision, *reference.input_size(content), 1)
         assert reference.mistake(content, run) < reference.TOLERANCES_PX[precision] / 2
 
 
 def test_a_sound_runtime_is_checked_once_and_says_nothing(monkeypatch):
     calls = []
-    monkeypatch.setattr(learned, "mistake", lambda *arguments: calls.append(arguments) or reference.mistake(*arguments))
+    monkeypatch.setattr(choice, "mistake", lambda *arguments: calls.append(arguments) or reference.mistake(*arguments))
     for seed in (0, 1):
         refiner = LearnedRefiner.of(random_content("cnn", seed), precision="fp32")
         refiner(coarse_of(SIZE), image_of(SIZE))
@@ -89,7 +88,7 @@ def test_a_sound_runtime_is_checked_once_and_says_nothing(monkeypatch):
 def test_a_wrong_runtime_gives_way_to_another_with_one_warning(broken):
     first, second = LEARNED[:2]
     expected = refined(second)[1]
-    learned._sound.clear()
+    choice._sound.clear()
     broken(first)
     rule = (
         rf"^network 'cnn' is run by {second} in fp32, since on this machine {first} in fp32 is off by 2 px on average$"

@@ -23,7 +23,7 @@ from stereokit_evaluation.common.sizes import Size
 from stereokit_evaluation.data import published
 from stereokit_evaluation.scoring.runner import Matching
 from stereokit_evaluation.study.configurations import Configuration, available_variants, build, describe_error
-from stereokit_refiners.learned import BACKENDS, PRECISIONS
+from stereokit_refiners.runtimes.choice import BACKENDS, PRECISIONS
 
 __all__ = ["PipelineRow", "as_json", "print_pipeline", "time_pipeline"]
 

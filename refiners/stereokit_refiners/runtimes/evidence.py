@@ -178,7 +178,8 @@ def hypotheses(
     height, width = -(-rows // MULTIPLE) * MULTIPLE, -(-columns // MULTIPLE) * MULTIPLE
     grid, quarter = (height // 2, width // 2), (height // 4, width // 4)
     lowest = int(np.floor(np.floor(disparity.min() * _STEPS + np.float32(0.5)) / _STEPS))
-    pair = _Pair(*(np.ascontiguousarray(array) for array in (disparity, candidates, left, right)))
+    arrays: Any = map(np.ascontiguousarray, (disparity, candidates, left, right))
+    pair = _Pair(*arrays)
     found = _Found(
         workspace.array("coarse", (height, width), np.float32),
         workspace.array("half", grid, np.float32),

@@ -1,8 +1,8 @@
 """Refining torch tensors where they are: on a GPU, without a copy to the host.
 
-`TensorRefiner` is `LearnedRefiner` in torch from end to end (scaling, network, upsampling). It takes tensors, or
-anything that torch can view without a copy, such as the device arrays of numba or CuPy
-(``__cuda_array_interface__``).
+`TensorRefiner` is `LearnedRefiner` of half-size maps in torch from end to end (scaling, network, upsampling). It takes
+tensors, or anything that torch can view without a copy, such as the device arrays of numba or CuPy
+(``__cuda_array_interface__``). `stereokit_refiners.runtimes.evidence_tensors` is the general refiner.
 """
 
 from __future__ import annotations
@@ -25,7 +25,18 @@ from stereokit_refiners.weights import NETWORKS, WeightFile, find, read
 if TYPE_CHECKING:
     from stereokit.cuda.pipeline import DeviceDisparity
 
-__all__ = ["TensorRefiner", "linear_on_device", "refine_on_device", "upscaled"]
+__all__ = [
+    "TensorRefiner",
+    "enlarged",
+    "linear_on_device",
+    "loaded_module",
+    "refine_on_device",
+    "running_on",
+    "upscaled",
+]
+
+# Of the `step` pixels along one of a map: its share, and which next one has the rest, that before (0) or after (1).
+_PHASES = {2: ((0.75, 0), (0.75, 1)), 4: ((0.625, 0), (0.875, 0), (0.875, 1), (0.625, 1))}
 
 
 class TensorRefiner:
@@ -34,7 +45,8 @@ class TensorRefiner:
     Parameters
     ----------
     refiner : str or WeightFile
-        A name ("stereovae", "cnn", "pyramid"), the path of a ``.safetensors`` file, or its content.
+        A name ("stereovae", "cnn", "pyramid"), the path of a ``.safetensors`` file, or its content. The general refiner
+        sees both images: see `stereokit_refiners.runtimes.evidence_tensors`.
     device : str
         Where to compute: "cuda", "cuda:1", "cpu".
     weights : str or None
@@ -43,7 +55,7 @@ class TensorRefiner:
     Raises
     ------
     OptionError
-        If torch has no such device.
+        If torch has no such device, or the network sees more than a half-size map and the left image.
     FileError
         If the weights cannot be used.
     """
@@ -59,11 +71,13 @@ class TensorRefiner:
             raise OptionError(f"device must be one that torch has, got {device!r} ({reason})") from None
         self.content = refiner
         self.network = NETWORKS[refiner.network]
+        if "evidence" in self.network.inputs:
+            raise OptionError(
+                f"refiner must be one that sees a half-size map alone, got {self.network.name!r}, "
+                "which Matcher.on_device runs on a GPU"
+            )
         self._rule = output_rule(self.network, refiner.output_mode)
-        self._module = Module(self.network)
-        self._module.load(refiner.arrays)
-        self._module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._module.eval().requires_grad_(False)
+        self._module = loaded_module(refiner, self.device)
 
     def __call__(self, coarse: Any, confidence: Any, left: Any, candidates: Any = None) -> Tensor:
         """Return the full-size map, on the device.
@@ -135,36 +149,48 @@ class TensorRefiner:
         return {name: encoded[name] for name in self.network.inputs}
 
 
+def loaded_module(content: WeightFile, device: torch.device) -> Module:
+    """Return a network with its weights on a device, ready to run."""
+    module = Module(NETWORKS[content.network])
+    module.load(content.arrays)
+    module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return module.eval().requires_grad_(False)
+
+
 def refine_on_device(
     content: WeightFile, coarse: DeviceDisparity, left: Any, stream: Any
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Refine a map that lies on the GPU with a network; see `stereokit_refiners.contract.DeviceRefiner`."""
-    with _running_on(stream, left) as device:
+    with running_on(stream, left) as device:
         refined = _cached_refiner(content, str(device))(coarse.disparity, coarse.confidence, left, coarse.candidates)
         rows, columns = refined.shape
-        sure = None if coarse.confidence is None else _doubled(_tensor(coarse.confidence), rows, columns)
-        return refined, _doubled(_tensor(coarse.valid), rows, columns), sure
+        sure = None if coarse.confidence is None else enlarged(_tensor(coarse.confidence), 2, rows, columns)
+        return refined, enlarged(_tensor(coarse.valid), 2, rows, columns), sure
 
 
-def linear_on_device(coarse: DeviceDisparity, left: Any, stream: Any) -> tuple[Tensor, Tensor, Tensor | None]:
+def linear_on_device(
+    coarse: DeviceDisparity, left: Any, stream: Any, step: int = 2
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """Upscale a map that lies on the GPU; see `stereokit_refiners.linear` and `DeviceRefiner`."""
-    with _running_on(stream, left):
+    with running_on(stream, left):
         rows, columns = _tensor(left).shape
-        known = _doubled(_tensor(coarse.valid), rows, columns)
+        known = enlarged(_tensor(coarse.valid), step, rows, columns)
         sure = None
         if coarse.confidence is not None:
-            sure = upscaled(_tensor(coarse.confidence), 1, rows, columns) * (known != 0)
-        return upscaled(_tensor(coarse.disparity), 2, rows, columns), known, sure
+            sure = upscaled(_tensor(coarse.confidence), 1, rows, columns, step) * (known != 0)
+        return upscaled(_tensor(coarse.disparity), step, rows, columns, step), known, sure
 
 
-def upscaled(image: Tensor, gain: float, rows: int, columns: int) -> Tensor:
-    """Return `stereokit_refiners.linear.upscaled` of a tensor: the same operations in the same order, the same bits."""
+def upscaled(image: Tensor, gain: float, rows: int, columns: int, step: int = 2) -> Tensor:
+    """Return what `stereokit_refiners.linear.Linear` makes of an image: the same operations in order, the same bits."""
+    if step == 1:
+        return image[:rows, :columns] * gain
     for axis, factor in ((0, gain), (1, 1)):
         ends = image.narrow(axis, 0, 1), image.narrow(axis, image.shape[axis] - 1, 1)
         before = torch.cat([ends[0], image.narrow(axis, 0, image.shape[axis] - 1)], axis)
         after = torch.cat([image.narrow(axis, 1, image.shape[axis] - 1), ends[1]], axis)
-        pair = [(image * 0.75 + other * 0.25) * factor for other in (before, after)]
-        image = torch.stack(pair, axis + 1).flatten(axis, axis + 1)
+        phases = [(image * share + (before, after)[side] * (1 - share)) * factor for share, side in _PHASES[step]]
+        image = torch.stack(phases, axis + 1).flatten(axis, axis + 1)
     return image[:rows, :columns].contiguous()
 
 
@@ -189,7 +215,7 @@ def _cached_refiner(content: WeightFile, device: str) -> TensorRefiner:
 
 
 @contextmanager
-def _running_on(stream: Any, left: Any) -> Iterator[torch.device]:
+def running_on(stream: Any, left: Any) -> Iterator[torch.device]:
     """Run torch's work on a stream of numba; yield the device that `left` lies on."""
     device = _tensor(left).device
     if device.type != "cuda":
@@ -203,9 +229,9 @@ def _running_on(stream: Any, left: Any) -> Iterator[torch.device]:
         yield device
 
 
-def _doubled(image: Tensor, rows: int, columns: int) -> Tensor:
-    """Return each pixel four times, cut to a size."""
-    large = image.repeat_interleave(2, 0).repeat_interleave(2, 1)
+def enlarged(image: Tensor, step: int, rows: int, columns: int) -> Tensor:
+    """Return each pixel ``step * step`` times, cut to a size; a copy."""
+    large = image.repeat_interleave(step, 0).repeat_interleave(step, 1)
     return large[:rows, :columns].contiguous()
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from stereokit.kernels.workspace import Workspace
 from stereokit.postprocess import fill, median, remove_speckles, single_matching_phase
 from stereokit.postprocess.chain import PostProcessing, post_process
+from stereokit.postprocess.chain_cuda import hold
 from stereokit.postprocess.chain_cuda import post_process as post_process_cuda
-from stereokit.postprocess.chain_cuda import raise_to
 from stereokit.postprocess.fill_cuda import fill as fill_cuda
 from stereokit.postprocess.median_cuda import median as median_cuda
 from stereokit.postprocess.smp_cuda import resolve
@@ -145,10 +145,13 @@ def check_chain(queue: Any, shape: tuple[int, int] = (9, 40)) -> None:
                 np.testing.assert_array_equal(queue.fetch(valid).reshape(shape), measured)
 
 
-def check_raise(queue: Any) -> None:
-    """Compare what lies below the lowest disparity; NaN stays."""
+def check_hold(queue: Any) -> None:
+    """Compare what lies outside the range; NaN stays."""
     disparity = map_of((5, 61), 4, 0.3, -12, 3)
-    raised = queue.upload("disparity", disparity.reshape(-1))
-    queue.launch(raise_to, 3, raised, -7, disparity.size)
-    want = np.where(disparity < -7, np.float32(-7), disparity)
-    np.testing.assert_array_equal(queue.fetch(raised).reshape(disparity.shape), want)
+    for low, high in ((-7.0, 1.0), (-7.0, np.inf)):
+        outside = np.count_nonzero(disparity < low), np.count_nonzero(disparity > high)
+        assert outside[0] and bool(outside[1]) == np.isfinite(high)
+        within = queue.upload("disparity", disparity.reshape(-1))
+        queue.launch(hold, 3, within, low, high, disparity.size)
+        want = np.clip(disparity, np.float32(low), np.float32(high))
+        np.testing.assert_array_equal(queue.fetch(within).reshape(disparity.shape), want)

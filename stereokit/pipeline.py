@@ -92,7 +92,8 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     disparity = full.disparity
     if settings.bounds is not None:
         low, high = settings.bounds
-        disparity = np.clip(disparity, np.float32(low), np.float32(high))
+        own = disparity if disparity.flags.writeable else None  # what a refiner returns is its own no more
+        disparity = np.clip(disparity, np.float32(low), np.float32(high), out=own)
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 

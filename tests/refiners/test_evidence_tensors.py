@@ -19,7 +19,7 @@ from stereokit_refiners.auto import SMALLEST, AutoRefiner  # noqa: E402
 from stereokit_refiners.learned import EvidenceRefiner  # noqa: E402
 from stereokit_refiners.linear import Linear  # noqa: E402
 from stereokit_refiners.networks.evidence import GAINS, LOGITS  # noqa: E402
-from stereokit_refiners.runtimes import evidence, evidence_tensors  # noqa: E402
+from stereokit_refiners.runtimes import evidence, evidence_tensors, features  # noqa: E402
 from stereokit_refiners.runtimes.mixture import mixture  # noqa: E402
 from stereokit_refiners.runtimes.tensors import TensorRefiner  # noqa: E402
 
@@ -80,7 +80,7 @@ def _check_same(coarse, left, right, step, device):
         value = value.cpu().numpy() if isinstance(value, torch.Tensor) else value
         np.testing.assert_array_equal(value, getattr(want, name), name)
     planes = evidence_tensors.network_input(result, *_on(device, coarse.confidence, left), left.shape[1])
-    expected = evidence.network_input(want, coarse.confidence, left, left.shape[1])
+    expected = features.network_input(want, coarse.confidence, left, left.shape[1])
     np.testing.assert_array_equal(planes.cpu().numpy(), expected)
     return want, result
 

@@ -127,4 +127,4 @@ def test_if_all_are_wrong_there_is_no_map_but_one_line(broken):
 def test_not_a_number_is_wrong_too(monkeypatch):
     content = random_content("cnn")
     head = np.full((*reference.SCENE_SIZE, 4), np.nan, np.float32)
-    assert reference.mistake(content, lambda inputs: head) == np.inf
+    assert reference.mistake(content, lambda inputs, use: use(head)) == np.inf

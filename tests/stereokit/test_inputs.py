@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import oracles
 import pytest
@@ -227,6 +228,21 @@ def test_smoothing_is_gaussian_and_keeps_fractions(shape, sigma):
     assert smooth(pair, 0) is pair
     constant = np.full(shape, 200, np.uint8)
     assert (smooth(gray_pair(constant, constant), sigma).left == 200 * 256).all()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 70), (5, 1), (2, 3), (37, 83)])
+def test_smoothing_is_that_of_opencv_to_the_last_bit(shape, dtype, threads):
+    largest = np.iinfo(dtype).max
+    left = np.random.default_rng(3).integers(0, largest, shape, dtype, endpoint=True)
+    pair = gray_pair(left, np.full(shape, largest, dtype))
+    for sigma in (0.2, 0.6, 0.7, 2.3, 10.0):
+        out = smooth(pair, sigma, threads=threads)
+        for image, source in ((out.left, pair.left), (out.right, pair.right)):
+            deep = source.astype(np.uint16) * np.uint16(256 if dtype == np.uint8 else 1)
+            expected = cv2.GaussianBlur(deep, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+            np.testing.assert_array_equal(image, expected.reshape(shape))
 
 
 @pytest.mark.parametrize("method", ["census+sgm", "zncc+sgm"])

@@ -1,6 +1,6 @@
 """The refiner of the network `stereokit_refiners.networks.evidence.Evidence` on torch tensors, where they are.
 
-`hypotheses` and `network_input` are those of `stereokit_refiners.runtimes.evidence`, operation by operation: the same
+`hypotheses` and `network_input` are those of `stereokit_refiners.runtimes`, operation by operation: the same
 integers and floats, bit for bit. `mixture` is that of `stereokit_refiners.runtimes.mixture` but for its exponentials,
 and the network runs in fp32. Nothing is copied to the host, no shape depends on the values, and nothing is waited for.
 
@@ -217,7 +217,7 @@ def _costs(bits: Tensor, coarse: Tensor, others: Tensor, base: Tensor, columns: 
 
 
 def network_input(values: TensorHypotheses, confidence: Tensor, left: Tensor, columns: int) -> Tensor:
-    """Return the network's input: `stereokit_refiners.runtimes.evidence.network_input`.
+    """Return the network's input: `stereokit_refiners.runtimes.features.network_input`.
 
     Parameters
     ----------

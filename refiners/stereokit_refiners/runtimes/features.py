@@ -52,7 +52,7 @@ def network_input(
     out = workspace.array("input", (*quarter, sum(CHANNELS.values())), np.int8)
     means = workspace.array("means", (3, *quarter), np.float32)
     images = np.ascontiguousarray(left), np.ascontiguousarray(confidence)
-    evidence: tuple[Any, ...] = found.half, found.others, means, found.cost, found.gains, found.base
+    evidence = found.half, found.others, means, found.cost, found.gains, found.base, found.sums
     reach = (columns + 1) // 2
     tasks = []
     for k, (y0, y1) in enumerate(spans(quarter[0], threads)):
@@ -60,10 +60,9 @@ def network_input(
         floats = part.array("floats", (5, width + 2), np.float32)
         place = part.array("place", width // 2, np.int32)
         planes = part.array("planes", (24, 2, width), np.int8)
-        lines: tuple[Any, ...] = floats, place, planes, planes.view(np.uint16)
-        tasks.append(
-            partial(_features, *images, *evidence, found.sums, reach, found.step, y0, y1, *lines, out.view(np.uint16))
-        )
+        lines = floats, place, planes, planes.view(np.uint16), out.view(np.uint16)
+        arguments: tuple[Any, ...] = (*images, *evidence, reach, found.step, y0, y1, *lines)
+        tasks.append(partial(_features, *arguments))
     run(tasks, threads)
     return np.moveaxis(out, 2, 0)
 

@@ -68,8 +68,8 @@ class LearnedRefiner:
     backend: str = "auto"
     precision: str = "auto"
     architecture: ClassVar[str] = ""
-    needs_weights: ClassVar[bool] = True
-    """Whether `weights` must be given, because none come with the package."""
+    of_half_size: ClassVar[bool] = True
+    """Whether it is one of half-size maps alone: commands give their option for weights to these first."""
     _file: WeightFile = field(init=False, repr=False, compare=False)
     _compiled: CompiledNetwork = field(init=False, repr=False, compare=False)
 
@@ -294,7 +294,7 @@ class EvidenceRefiner(LearnedRefiner):
     """The one for every camera: see `stereokit_refiners.networks.evidence`."""
 
     architecture: ClassVar[str] = "evidence"
-    needs_weights: ClassVar[bool] = False
+    of_half_size: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, eq=False)

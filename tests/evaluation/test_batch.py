@@ -233,7 +233,7 @@ def test_bad_options_are_refused_before_anything_is_made(tmp_path):
         (("--engine", "dask"), "go together"),
         (("--scheduler", "tcp://x:1"), "go together"),
         (("--workers", "0"), "workers must be"),
-        (("--refiner", "stereovae"), "needs weights: 'kitti'"),
+        (("--refiner", "pyramid"), "needs weights: 'kitti'"),
     ):
         assert line in refused(tmp_path, *out, *words)
     assert not (tmp_path / "out").exists()

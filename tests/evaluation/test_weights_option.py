@@ -38,7 +38,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_refiners_that_come_without_weights_get_them_and_else_the_general_one():
+def test_refiners_of_half_size_maps_get_them_and_else_the_general_one():
     assert weights_option("cnn", "kitti") == weights_option("pyramid", "kitti") == {"weights": "kitti"}
     assert weights_option("stereokit", "kitti") == weights_option("general", "kitti") == {"weights": "kitti"}
     assert weights_option("stereokit", "kitti", ["stereokit", "linear"]) == {"weights": "kitti"}
@@ -60,7 +60,7 @@ def test_refiners_that_come_without_weights_get_them_and_else_the_general_one():
 
 def test_match_takes_them_and_says_what_is_missing_without(folder):
     words = ["match", "left.png", "right.png", "-o", "map.npy", "--max-disparity", 16, "--scale", 0.5]
-    failed(run(*words, "--refiner", "cnn"), "refiner 'cnn' needs weights", "pip install ./refiners/kitti")
+    failed(run(*words, "--refiner", "pyramid"), "refiner 'pyramid' needs weights", "pip install ./refiners/kitti")
     failed(run(*words, "--refiner", "cnn", "--weights", "kity"), "no weights named 'kity'", "kitti")
     failed(run(*words, "--refiner", "cnn", "--set", "weights=kitti"), "use --weights")
     failed(run(*words, "--refiner", "linear", "--weights", "kitti"), "weights")
@@ -88,11 +88,11 @@ def test_evaluate_gives_them_to_the_rows_that_need_them():
     assert document["options"]["weights"] == "kitti"
 
 
-def test_the_study_gives_them_to_the_settings_that_need_them():
-    settings = ["linear", "original", "cnn", "stereokit"]
+def test_the_study_gives_them_to_the_settings_of_half_size_maps():
+    settings = ["linear", "original", "pyramid", "stereokit"]
     bare = {cell.variant: cell for cell in build(["S2"], settings, {})}
-    assert "needs weights" in bare["cnn"].missing
+    assert "needs weights" in bare["pyramid"].missing
     cells = {cell.variant: cell for cell in build(["S2"], settings, {"weights": "kitti"})}
     assert [cell.missing for cell in cells.values()] == [None] * 4
     assert cells["stereokit"].identity == bare["stereokit"].identity
-    assert cells["cnn"].identity["refiner"]["weights"]
+    assert cells["pyramid"].identity["refiner"]["weights"]

@@ -221,8 +221,14 @@ def test_architectures_by_name():
         network_named("stereovea")
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_networks_that_come_without_weights_say_where_there_are_some(name):
+@pytest.mark.parametrize("name", ["evidence", "cnn", "stereovae"])
+def test_networks_that_come_with_weights_saw_no_frame_of_a_data_set(name):
+    content = find(name, None)
+    assert content.network == name and content.ranges and content.notes.get("frames", []) == []
+
+
+def test_networks_that_come_without_weights_say_where_there_are_some():
+    name = "pyramid"
     with pytest.raises(FileError) as caught:
         find(name, None)
     line = one_line(caught.value)
@@ -269,7 +275,8 @@ def test_a_collection_that_is_not_installed_says_how_to_install_it_and_under_whi
 
 
 @pytest.mark.parametrize(
-    ("name", "tuned"), [("evidence", False), ("evidence", True), *((name, True) for name in NAMES)]
+    ("name", "tuned"),
+    [(name, tuned) for name in ("evidence", *NAMES) for tuned in (False, True) if tuned or name != "pyramid"],
 )
 def test_weights_that_are_published(name, tuned):
     content = tuned_to_kitti(name) if tuned else shipped(name)

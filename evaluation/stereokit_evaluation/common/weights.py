@@ -1,4 +1,4 @@
-"""Which refiners of a command get its ``--weights``: those that come without; if there are none, the general one."""
+"""Which refiners of a command get its ``--weights``: those of half-size maps; if there are none, the general one."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any
 from stereokit.errors import OptionError
 from stereokit.methods import find_refiner
 
-__all__ = ["check_weights", "needs_weights", "weights_option"]
+__all__ = ["check_weights", "is_of_half_size", "weights_option"]
 
 
-def needs_weights(refiner: str) -> bool:
-    """Return whether a refiner comes without weights."""
-    return bool(getattr(find_refiner(refiner)[1], "needs_weights", False))
+def is_of_half_size(refiner: str) -> bool:
+    """Return whether a refiner is a network of half-size maps alone."""
+    return bool(getattr(find_refiner(refiner)[1], "of_half_size", False))
 
 
 def _receivers(refiners: Sequence[str]) -> set[str]:
-    needing = {name for name in refiners if needs_weights(name)}
-    return needing or {name for name in refiners if "weights" in find_refiner(name)[2]}
+    first = {name for name in refiners if is_of_half_size(name)}
+    return first or {name for name in refiners if "weights" in find_refiner(name)[2]}
 
 
 def weights_option(refiner: str | None, weights: str | None, refiners: Sequence[str] = ()) -> dict[str, Any]:

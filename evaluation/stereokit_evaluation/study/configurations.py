@@ -26,7 +26,7 @@ from stereokit.matching import METHODS, Matcher
 from stereokit.methods import find_refiner, option_names, parse_method
 from stereokit.registry import AGGREGATIONS, COSTS, REFINERS
 from stereokit_evaluation.bench import baselines
-from stereokit_evaluation.common.weights import needs_weights
+from stereokit_evaluation.common.weights import is_of_half_size
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.outside import MapFolder, OutsideMethod
 from stereokit_evaluation.scoring.runner import Matching
@@ -200,11 +200,11 @@ def build(
             raise OptionError(f"option {option!r} must belong to a chosen method, got {', '.join(method_names)}")
     refiner_options = {variant: _refiner_options(variant) for variant in variants}
     all_refiner_options = {option for names_ in refiner_options.values() for option in names_}
-    without_weights = {variant for variant in variants if refiner_options[variant] and needs_weights(variant)}
+    receivers = {variant for variant in variants if refiner_options[variant] and is_of_half_size(variant)}
 
     def options_of(name: str, variant: str) -> dict[str, Any]:
         excluded = _foreign(name) | all_refiner_options - refiner_options[variant]
-        if variant not in without_weights or (name, variant) in (trained or {}):
+        if variant not in receivers or (name, variant) in (trained or {}):
             excluded |= {"weights"}
         return {option: value for option, value in options.items() if option not in excluded}
 

@@ -162,10 +162,13 @@ def run_training(
                 step(pair.name)
         return paths
 
+    searched = [max_disparity]  # by samples of whatever kind
+
     def stored_pairs(step: Callable[..., None]) -> list[Path]:
         paths = []
         for pair in generated_pairs(generated, cache_folder / "pairs", own):
             levels = max(max_disparity, levels_for(pair))
+            searched.append(levels)
             for n, name in itertools.product((0, 1), methods):
                 paths.append(store_variant(pair, name, training_settings.seed, n, levels, cache_folder))
                 step(f"{pair.name} {name}")
@@ -201,8 +204,9 @@ def run_training(
             folder,
             world,
             trained_on,
-            max_disparity,
-            {} if own is None else {"assets": own.notes},
+            max(searched),
+            {"streets": streets, "generated": generated, "first_seed": FIRST_SEED, "methods": methods}
+            | ({} if own is None else {"assets": own.notes}),
         )
         results.append(outcome | {"held_out": [frame.name for frame in held_out]})
     return {
@@ -278,8 +282,7 @@ def _join_group(torch: Any) -> tuple[int, int]:
 
 def _train_one(
     refiner: str, sources: Any, held_out_samples: Sequence[Any], labels: Sequence[tuple[str, str]], settings: Any,
-    start: Any, folder: Path, world: tuple[int, int], trained_on: Sequence[str], max_disparity: int,
-    assets: dict[str, Any],
+    start: Any, folder: Path, world: tuple[int, int], trained_on: Sequence[str], largest: int, more: dict[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
     """Train, calibrate, write the folder; return the counts of bad and known pixels by matcher."""
     from stereokit_refiners.training.loop import bad_pixels, calibrated, fit, predict, restored
@@ -310,11 +313,11 @@ def _train_one(
     if world[0] == 0:
         ranges = calibrated(module, settings.output_mode, sources)
         notes = {
-            "disparities": [0, max_disparity],
+            "disparities": [0, largest],
             "frames": sorted(trained_on),
             "settings": asdict(settings),
             "start": None if start is None else start.fingerprint,
-            **assets,
+            **more,
         }
         write(folder / "weights.safetensors", WeightFile(refiner, settings.output_mode, arrays, ranges, notes))
         write_bytes(folder / "curves.csv", history.csv())

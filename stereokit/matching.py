@@ -358,11 +358,14 @@ class Matcher:
 
     def _call(self, left: Any, right: Any, mask: Any, right_mask: Any, threads: int) -> tuple[Disparity, list[str]]:
         """Match a pair; return the map and the warnings about them."""
-        with span("prepare", "checks and grey"):
-            pair = gray_pair(left, right, self.settings.nodata, mask, right_mask)
-        result = self.match_gray(pair, threads)
-        with span("clean", "signs of a bad pair"):
-            faults = self._watch.faults(pair, result, self.min_disparity, self.max_disparity)
+        with team(threads) as members:
+            if self.device == "cpu":
+                members.summon()
+            with span("prepare", "checks and grey"):
+                pair = gray_pair(left, right, self.settings.nodata, mask, right_mask)
+            result = self.match_gray(pair, threads)
+            with span("clean", "signs of a bad pair"):
+                faults = self._watch.faults(pair, result, self.min_disparity, self.max_disparity)
         return result, [fault.message for fault in faults]
 
     def match_gray(self, pair: GrayPair, threads: int, keeps_blank: bool | None = None) -> Disparity:

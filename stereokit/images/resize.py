@@ -13,7 +13,7 @@ from stereokit.images.gray import GrayPair
 from stereokit.kernels.jit import kernel
 from stereokit.kernels.threads import run, spans
 
-__all__ = ["half_size", "reduced", "reduced_mask"]
+__all__ = ["half_size", "halved", "reduced", "reduced_mask"]
 
 
 def reduced(pair: GrayPair, step: int, threads: int = 1) -> GrayPair:
@@ -66,6 +66,14 @@ def half_size(pair: GrayPair, threads: int = 1, *, tolerant: bool = False) -> Gr
     )
     run(tasks, threads)
     return half
+
+
+def halved(image: NDArray[Any], threads: int = 1) -> NDArray[Any]:
+    """Return an image at half size, as `half_size` does it: (H, W) uint8 or uint16 -> (ceil(H/2), ceil(W/2))."""
+    out = np.empty(tuple(-(-length // 2) for length in image.shape), image.dtype)
+    image = np.ascontiguousarray(image)
+    run([partial(_halve, image, y0, y1, out) for y0, y1 in spans(len(out), threads)], threads)
+    return out
 
 
 def reduced_mask(mask: NDArray[np.bool_] | None, step: int) -> NDArray[np.bool_] | None:

@@ -216,16 +216,21 @@ class Team:
         for tasks in stages:
             self._run(_Stage(tasks))
 
+    def summon(self, members: int | None = None) -> None:
+        """Call so many members that are not here, or all: to wake a thread takes longer than many a stage does."""
+        words = self._words
+        for k in range(1, len(words) if members is None else members):
+            if words[k] == _ABSENT:
+                words[k] = _CALLED
+                _workers.submit(partial(self._help, k))
+
     def _run(self, stage: _Stage) -> None:
         words = self._words
         members = min(stage.size, len(words))
         try:
             self._stage = stage
             words[0] += 1
-            for k in range(1, members):
-                if words[k] == _ABSENT:
-                    words[k] = _CALLED
-                    _workers.submit(partial(self._help, k))
+            self.summon(members)
             stage.work(0, members)
         finally:
             stage.unclaimed.clear()  # after an error nobody needs the rest

@@ -1,0 +1,89 @@
+"""The option `evidence_scale`: images of half the size are looked at, and the rest is linear."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+import stereokit
+from stereokit.errors import DeviceError, OptionError
+from stereokit.images.resize import halved
+from stereokit_refiners.learned import EvidenceRefiner
+from stereokit_refiners.linear import Linear
+from stereokit_refiners.weights import read, shipped, write
+
+
+def images(rows, columns, seed=0):
+    rng = np.random.default_rng(seed)
+    return tuple(rng.integers(0, 256, (rows, columns), dtype=np.uint8) for _ in range(2))
+
+
+def coarse_map(rows, columns, seed=1):
+    rng = np.random.default_rng(seed)
+    disparity = (rng.random((rows, columns)) * 5 + 2).astype(np.float32)
+    candidates = (rng.random((2, rows, columns)) * 5 + 2).astype(np.float32)
+    valid = rng.random((rows, columns)) < 0.8
+    confidence = rng.random((rows, columns)).astype(np.float32)
+    return stereokit.Disparity(disparity, valid, confidence, candidates=candidates)
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.25])
+@pytest.mark.parametrize("size", [(64, 96), (53, 75), (17, 130)])
+def test_the_map_is_that_of_half_size_images_upscaled_linearly(scale, size):
+    left, right = images(*size)
+    step = round(1 / scale)
+    coarse = coarse_map(-(-size[0] // step), -(-size[1] // step))
+    actual = EvidenceRefiner(precision="fp32", evidence_scale=0.5)(coarse, left, right=right, scale=scale)
+    half = EvidenceRefiner(precision="fp32")(coarse, halved(left), right=halved(right), scale=2 * scale)
+    expected = Linear()(half, left)
+    np.testing.assert_array_equal(actual.disparity, expected.disparity)
+    rows, columns = np.indices(size) // step
+    np.testing.assert_array_equal(actual.valid, coarse.valid[rows, columns])
+    np.testing.assert_array_equal(actual.confidence[actual.valid], expected.confidence[actual.valid])
+
+
+def test_gaps_stay_gaps():
+    left, right = images(64, 96)
+    coarse = coarse_map(16, 24)
+    coarse.disparity[4:8, 6:12] = np.nan
+    full = EvidenceRefiner(evidence_scale=0.5)(coarse, left, right=right, scale=0.25)
+    assert np.isnan(full.disparity[16:32, 24:48]).all() and not np.isnan(full.disparity[40:, 60:]).any()
+    assert not full.valid[np.isnan(full.disparity)].any()
+
+
+def test_a_wall_comes_out_flat_at_any_number_of_threads():
+    texture = np.repeat(np.repeat(np.random.default_rng(2).integers(0, 256, (40, 80), dtype=np.uint8), 4, 0), 4, 1)
+    left, right = np.ascontiguousarray(texture[:, :256]), np.ascontiguousarray(texture[:, 16:272])
+    options = {"max_disparity": 64, "scale": 0.25, "refiner": "stereokit", "evidence_scale": 0.5, "device": "cpu"}
+    maps = [stereokit.match(left, right, "S2", threads=threads, **options) for threads in (1, 2, 3)]
+    assert abs(np.median(maps[0][:, 40:]) - 16) < 0.1
+    for other in maps[1:]:
+        np.testing.assert_array_equal(other, maps[0])
+
+
+def test_it_is_told_apart_and_survives_a_copy(tmp_path):
+    plain, half = EvidenceRefiner(), EvidenceRefiner(evidence_scale=0.5)
+    assert plain != half and plain.fingerprint != half.fingerprint
+    copy = pickle.loads(pickle.dumps(half))
+    assert copy == half and copy.evidence_scale == 0.5
+    write(tmp_path / "mine.safetensors", shipped("evidence"))
+    assert read(tmp_path / "mine.safetensors").fingerprint == shipped("evidence").fingerprint
+    assert EvidenceRefiner(str(tmp_path / "mine.safetensors"), evidence_scale=0.5) == half
+
+
+def test_what_cannot_be_is_refused_in_one_line():
+    for value in (0.25, 2, 0, True, "0.5", None):
+        with pytest.raises(OptionError, match=r"^evidence_scale must be 1 or 0.5, got "):
+            EvidenceRefiner(evidence_scale=value)
+    left, right = images(32, 48)
+    with pytest.raises(OptionError, match=r"^evidence_scale must be 1 where .*, got 0.5 with scale 1$"):
+        stereokit.match(left, right, "S2", scale=1, refiner="stereokit", evidence_scale=0.5, max_disparity=16)
+    refiner = EvidenceRefiner(evidence_scale=0.5)
+    with pytest.raises(OptionError, match="right must have the size of left"):
+        refiner(coarse_map(8, 12), left, scale=0.25)
+    with pytest.raises(OptionError, match="coarse map must be half the size of left"):
+        refiner(coarse_map(7, 12), left, right=right, scale=0.25)
+    with pytest.raises(DeviceError, match=r"^evidence_scale must be 1 for images on the device, got 0.5$"):
+        refiner.on_device(coarse_map(8, 12), left, None, right=right, scale=0.25)

@@ -5,7 +5,8 @@ Importing this package imports neither torch nor any runtime: they are loaded wh
 
 from stereokit_refiners.auto import AutoRefiner
 from stereokit_refiners.contract import Refiner
-from stereokit_refiners.learned import CnnRefiner, EvidenceRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
+from stereokit_refiners.general import EvidenceRefiner
+from stereokit_refiners.learned import CnnRefiner, LearnedRefiner, PyramidRefiner, StereoVaeRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.weights import WeightFile
 

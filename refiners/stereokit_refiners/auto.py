@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stereokit.errors import OptionError, StereokitError
 from stereokit.notices import warn
 from stereokit.result import Disparity
-from stereokit_refiners.learned import EvidenceRefiner
+from stereokit_refiners.general import EvidenceRefiner
 from stereokit_refiners.linear import Linear
 
 if TYPE_CHECKING:

@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereokit.errors import DeviceError, OptionError
-from stereokit.images.resize import halved
+from stereokit.errors import OptionError
 from stereokit.notices import warn
 from stereokit.postprocess import fill
 from stereokit.registry import REFINERS
 from stereokit.result import Disparity
 from stereokit_refiners.contract import on_tensors
-from stereokit_refiners.linear import doubled, enlarged, upscaled
+from stereokit_refiners.linear import doubled, enlarged
 from stereokit_refiners.runtimes.choice import CompiledNetwork, backend_named, precision_named
 from stereokit_refiners.runtimes.encode import base_of, encode
 from stereokit_refiners.runtimes.evidence import hypotheses
@@ -31,11 +30,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CnnRefiner",
-    "EvidenceRefiner",
     "LearnedRefiner",
     "PyramidRefiner",
     "StereoVaeRefiner",
     "learned_names",
+    "right_of",
 ]
 
 _FEW = 0.01  # of the pixels may lie beyond the disparities of the training
@@ -291,69 +290,6 @@ class LearnedRefiner:
 
 
 @dataclass(frozen=True, eq=False)
-class EvidenceRefiner(LearnedRefiner):
-    """The one for every camera: see `stereokit_refiners.networks.evidence`.
-
-    Parameters
-    ----------
-    weights, backend, precision : str
-        As of `LearnedRefiner`.
-    evidence_scale : {1, 0.5}
-        Size of the images that are looked at. With 0.5 it refines a map of a quarter or half of the size up to half
-        size, and upscales that linearly: in less than half of the time, with errors between its own and linear ones.
-    """
-
-    evidence_scale: float = 1
-    architecture: ClassVar[str] = "evidence"
-    of_half_size: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        if isinstance(self.evidence_scale, bool) or self.evidence_scale not in (1, 0.5):
-            raise OptionError(f"evidence_scale must be 1 or 0.5, got {self.evidence_scale!r}")
-        super().__post_init__()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "evidence_scale": self.evidence_scale}
-
-    @property
-    def fingerprint(self) -> str:
-        """What the result depends on, beside the inputs."""
-        return super().fingerprint + ("" if self.evidence_scale == 1 else f"-{self.evidence_scale:g}")
-
-    def __call__(
-        self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
-        threads: int = 1,
-    ) -> Disparity:  # fmt: skip
-        """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
-        if self.evidence_scale == 1:
-            return super().__call__(coarse, left, right=right, scale=scale, threads=threads)
-        self._check_evidence_scale(scale)
-        other = _right_of(left, right)
-        views = halved(left, threads), halved(other, threads)
-        half = super().__call__(coarse, views[0], right=views[1], scale=2 * scale, threads=threads)
-        rows, columns = left.shape
-        disparity = upscaled(half.disparity, 2, rows, columns, threads)
-        known = enlarged(coarse.valid.view(np.uint8), round(1 / scale), rows, columns).view(np.bool_)
-        if np.isnan(coarse.disparity).any():
-            known &= ~np.isnan(disparity)
-        assert half.confidence is not None
-        return Disparity(disparity, known, upscaled(half.confidence, 1, rows, columns, threads))
-
-    def _check_evidence_scale(self, scale: float) -> None:
-        if scale > self.evidence_scale:
-            rule = "evidence_scale must be 1 where the map has more pixels than the images that would be looked at"
-            raise OptionError(f"{rule}, got {self.evidence_scale:g} with scale {scale:g}")
-
-    def on_device(
-        self, coarse: DeviceDisparity, left: Any, stream: Any, *, right: Any = None, scale: float = 0.5
-    ) -> tuple[Any, Any, Any]:
-        """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
-        if self.evidence_scale != 1:
-            raise DeviceError(f"evidence_scale must be 1 for images on the device, got {self.evidence_scale:g}")
-        return super().on_device(coarse, left, stream, right=right, scale=scale)
-
-
-@dataclass(frozen=True, eq=False)
 class StereoVaeRefiner(LearnedRefiner):
     """StereoVAE (Chang et al. 2023); see `stereokit_refiners.networks.stereovae`."""
 
@@ -389,13 +325,13 @@ def _check_size(disparity: Any, left: Any, step: int) -> None:
 
 def _evidence_of(coarse: Disparity | DeviceDisparity, left: Any, right: Any) -> tuple[Any, Any, Any]:
     """Return candidates, confidence and the right image; OptionError where one is missing or has another size."""
-    right = _right_of(left, right)
+    right = right_of(left, right)
     if coarse.confidence is None or coarse.candidates is None:
         raise OptionError("coarse must come with confidence and candidates for this refiner, got none")
     return coarse.candidates, coarse.confidence, right
 
 
-def _right_of(left: Any, right: Any) -> Any:
+def right_of(left: Any, right: Any) -> Any:
     """Return the right image; OptionError where it is missing or has another size than the left one."""
     if right is None or tuple(right.shape) != tuple(left.shape):
         got = "none" if right is None else tuple(right.shape)

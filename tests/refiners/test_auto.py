@@ -11,7 +11,7 @@ from refining import coarse_of, image_of
 import stereokit
 from stereokit.errors import OptionError, StereokitError, StereokitWarning
 from stereokit_refiners.auto import SMALLEST, AutoRefiner
-from stereokit_refiners.learned import EvidenceRefiner
+from stereokit_refiners.general import EvidenceRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.runtimes import choice
 

@@ -12,7 +12,7 @@ from refining import tuned_to_kitti
 import stereokit
 from stereokit.errors import FileError, OptionError
 from stereokit_refiners import weights
-from stereokit_refiners.learned import EvidenceRefiner
+from stereokit_refiners.general import EvidenceRefiner
 from stereokit_refiners.networks.evidence import CHANNELS, GAINS, LOGITS, STEPS, Evidence
 from stereokit_refiners.networks.layers import shapes
 from stereokit_refiners.runtimes.evidence import hypotheses

@@ -10,7 +10,7 @@ import pytest
 import stereokit
 from stereokit.errors import DeviceError, OptionError
 from stereokit.images.resize import halved
-from stereokit_refiners.learned import EvidenceRefiner
+from stereokit_refiners.general import EvidenceRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.weights import read, shipped, write
 
@@ -87,3 +87,36 @@ def test_what_cannot_be_is_refused_in_one_line():
         refiner(coarse_map(7, 12), left, right=right, scale=0.25)
     with pytest.raises(DeviceError, match=r"^evidence_scale must be 1 for images on the device, got 0.5$"):
         refiner.on_device(coarse_map(8, 12), left, None, right=right, scale=0.25)
+
+
+@pytest.mark.parametrize(("scale", "evidence_scale"), [(1, 1), (0.5, 1), (0.25, 1), (0.25, 0.5)])
+def test_a_second_pass_refines_the_first_ones_map(scale, evidence_scale):
+    size = (53, 75)
+    left, right = images(*size)
+    step = round(1 / scale)
+    coarse = coarse_map(-(-size[0] // step), -(-size[1] // step))
+    twice = EvidenceRefiner(precision="fp32", evidence_scale=evidence_scale, passes=2)
+    actual = twice(coarse, left, right=right, scale=scale)
+    once = EvidenceRefiner(precision="fp32")
+    views, step = (left, right), round(evidence_scale / scale)
+    if evidence_scale == 0.5:
+        views = halved(left), halved(right)
+    first = once(coarse, views[0], right=views[1], scale=1 / step)
+    rows, columns = np.indices(views[0].shape) // step
+    again = stereokit.Disparity(
+        first.disparity, first.valid, first.confidence, candidates=coarse.candidates[:, rows, columns] * step
+    )
+    second = once(again, views[0], right=views[1], scale=1)
+    expected = second if evidence_scale == 1 else Linear()(second, left)
+    np.testing.assert_array_equal(actual.disparity, expected.disparity)
+    assert np.abs(second.disparity - first.disparity).max() > 0.1
+    assert once.fingerprint != EvidenceRefiner(precision="fp32", passes=2).fingerprint
+
+
+def test_a_number_of_passes_that_cannot_be_is_refused():
+    for value in (0, 5, 1.5, True):
+        with pytest.raises(OptionError, match="passes"):
+            EvidenceRefiner(passes=value)
+    with pytest.raises(DeviceError, match="passes must be 1"):
+        EvidenceRefiner(passes=2).on_device(coarse_map(8, 12), images(32, 48)[0], None)
+    assert pickle.loads(pickle.dumps(EvidenceRefiner(passes=3))).passes == 3

@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
 from stereokit_refiners.auto import SMALLEST, AutoRefiner  # noqa: E402
-from stereokit_refiners.learned import EvidenceRefiner  # noqa: E402
+from stereokit_refiners.general import EvidenceRefiner  # noqa: E402
 from stereokit_refiners.linear import Linear  # noqa: E402
 from stereokit_refiners.networks.evidence import GAINS, LOGITS  # noqa: E402
 from stereokit_refiners.runtimes import evidence, evidence_tensors, features  # noqa: E402

@@ -34,9 +34,10 @@ class EvidenceRefiner(LearnedRefiner):
     evidence_scale : {1, 0.5}
         Size of the images that are looked at. With 0.5 it refines a map of a quarter or half of the size up to half
         size, and upscales that linearly: in less than half of the time, with errors between its own and linear ones.
-    passes : int
+    passes : int or None
         How often it refines, 1 to 4: from the second time on its own map. Indoors and of near things two passes leave
-        up to a tenth fewer errors, on roads as many; each takes as long as the first.
+        up to a tenth fewer errors than one, on roads as many; each takes as long as the first. None is two for maps of
+        the images' size, for which accuracy counts, and else one.
 
     Raises
     ------
@@ -45,14 +46,15 @@ class EvidenceRefiner(LearnedRefiner):
     """
 
     evidence_scale: float = 1
-    passes: int = 1
+    passes: int | None = None
     architecture: ClassVar[str] = "evidence"
     of_half_size: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if isinstance(self.evidence_scale, bool) or self.evidence_scale not in (1, 0.5):
             raise OptionError(f"evidence_scale must be 1 or 0.5, got {self.evidence_scale!r}")
-        object.__setattr__(self, "passes", check_integer("passes", self.passes, 1, _MOST_PASSES))
+        if self.passes is not None:
+            object.__setattr__(self, "passes", check_integer("passes", self.passes, 1, _MOST_PASSES))
         super().__post_init__()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -62,7 +64,7 @@ class EvidenceRefiner(LearnedRefiner):
     def fingerprint(self) -> str:
         """What the result depends on, beside the inputs."""
         scale = "" if self.evidence_scale == 1 else f"-{self.evidence_scale:g}"
-        return super().fingerprint + scale + ("" if self.passes == 1 else f"-x{self.passes}")
+        return super().fingerprint + scale + ("" if self.passes is None else f"-x{self.passes}")
 
     def __call__(
         self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
@@ -70,12 +72,12 @@ class EvidenceRefiner(LearnedRefiner):
     ) -> Disparity:  # fmt: skip
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
         if self.evidence_scale == 1:
-            return self._refined(coarse, left, right, scale, threads)
+            return super().__call__(coarse, left, right=right, scale=scale, threads=threads)
         if scale > self.evidence_scale:
             rule = "evidence_scale must be 1 where the map has more pixels than the images that would be looked at"
             raise OptionError(f"{rule}, got {self.evidence_scale:g} with scale {scale:g}")
         views = halved(left, threads), halved(right_of(left, right), threads)
-        half = self._refined(coarse, *views, 2 * scale, threads)
+        half = super().__call__(coarse, views[0], right=views[1], scale=2 * scale, threads=threads)
         rows, columns = left.shape
         disparity = upscaled(half.disparity, 2, rows, columns, threads)
         known = enlarged(coarse.valid.view(np.uint8), round(1 / scale), rows, columns).view(np.bool_)
@@ -84,26 +86,14 @@ class EvidenceRefiner(LearnedRefiner):
         assert half.confidence is not None
         return Disparity(disparity, known, upscaled(half.confidence, 1, rows, columns, threads))
 
-    def _refined(
-        self, coarse: Disparity, left: NDArray[Any], right: NDArray[Any] | None, scale: float, threads: int
-    ) -> Disparity:
-        """Return what all passes make of a map."""
-        full = super().__call__(coarse, left, right=right, scale=scale, threads=threads)
-        if self.passes == 1:
-            return full
-        step = np.float32(round(1 / scale))
-        assert coarse.candidates is not None
-        candidates = np.stack([enlarged(one, round(step), *left.shape) * step for one in coarse.candidates])
-        for _ in range(self.passes - 1):
-            again = Disparity(full.disparity, full.valid, full.confidence, candidates=candidates)
-            full = super().__call__(again, left, right=right, scale=1, threads=threads)
-        return full
+    def _passes_at(self, step: int) -> int:
+        """Return how often a map is refined, whose pixels are so many of the images' that are looked at."""
+        return super()._passes_at(step) if self.passes is None else self.passes
 
     def on_device(
         self, coarse: DeviceDisparity, left: Any, stream: Any, *, right: Any = None, scale: float = 0.5
     ) -> tuple[Any, Any, Any]:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
-        for name, value in (("evidence_scale", self.evidence_scale), ("passes", self.passes)):
-            if value != 1:
-                raise DeviceError(f"{name} must be 1 for images on the device, got {value:g}")
+        if self.evidence_scale != 1:
+            raise DeviceError(f"evidence_scale must be 1 for images on the device, got {self.evidence_scale:g}")
         return super().on_device(coarse, left, stream, right=right, scale=scale)

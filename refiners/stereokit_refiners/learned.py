@@ -262,17 +262,34 @@ class LearnedRefiner:
         gaps = bool(unknown.any())
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
-        with self._compiled.workspaces(rows, columns, step).take() as workspace:
-            values = hypotheses(disparity, candidates, left, other, step, threads, workspace)
-            inputs = {"evidence": network_input(values, confidence, left, columns, threads, workspace)}
-            finish = partial(mixture, found=values, rows=rows, columns=columns, threads=threads)
-            full, sure = self._compiled.run(inputs, threads, finish)
+        full, sure = self._one_pass(disparity, candidates, confidence, left, other, step, threads)
+        for again in range(1, self._passes_at(step)):
+            if again == 1:
+                candidates = np.stack([enlarged(one, step, rows, columns) * np.float32(step) for one in candidates])
+            full, sure = self._one_pass(full, candidates, sure, left, other, 1, threads)
         known = enlarged(coarse.valid.view(np.uint8), step, rows, columns).view(np.bool_)
         if gaps:
             missing = enlarged(unknown.view(np.uint8), step, rows, columns).view(np.bool_)
             full[missing] = np.nan
             known &= ~missing
         return Disparity(full, known, sure)
+
+    def _one_pass(
+        self, disparity: NDArray[np.float32], candidates: NDArray[np.float32], confidence: NDArray[np.float32],
+        left: NDArray[Any], right: NDArray[Any], step: int, threads: int,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+        """Return the map and how sure it is."""
+        rows, columns = left.shape
+        with self._compiled.workspaces(rows, columns, step).take() as workspace:
+            values = hypotheses(disparity, candidates, left, right, step, threads, workspace)
+            inputs = {"evidence": network_input(values, confidence, left, columns, threads, workspace)}
+            finish = partial(mixture, found=values, rows=rows, columns=columns, threads=threads)
+            full, sure = self._compiled.run(inputs, threads, finish)
+        return full, sure
+
+    def _passes_at(self, step: int) -> int:
+        """Return how often a network that weighs values does so: from the second time on its own map."""
+        return 2 if step == 1 else 1
 
     def on_device(
         self, coarse: DeviceDisparity, left: Any, stream: Any, *, right: Any = None, scale: float = 0.5
@@ -283,7 +300,9 @@ class LearnedRefiner:
             step = round(1 / scale)
             _check_size(coarse.disparity, left, step)
             _evidence_of(coarse, left, right)
-            maps = on_tensors("evidence_tensors").weigh_on_device(self._file, coarse, left, right, step, stream)
+            maps = on_tensors("evidence_tensors").weigh_on_device(
+                self._file, coarse, left, right, step, stream, self._passes_at(step)
+            )
         else:
             maps = on_tensors().refine_on_device(self._file, coarse, left, stream)
         return maps

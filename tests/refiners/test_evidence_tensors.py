@@ -137,11 +137,11 @@ def test_the_mixture_is_the_same_but_for_exponentials(step, device):
     np.testing.assert_allclose(sure.cpu().numpy(), likely, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("step", [1, 2, 4])
+@pytest.mark.parametrize(("step", "passes"), [(1, 1), (2, 1), (4, 1), (1, None), (2, 2)])
 @pytest.mark.parametrize("size", [(16, 16), (61, 75), (96, 128)])
-def test_on_tensors_the_refiner_gives_the_map_of_arrays(size, step, device):
+def test_on_tensors_the_refiner_gives_the_map_of_arrays(size, step, passes, device):
     coarse, left, right = _coarse(size, step, -4, 30, seed=3), image_of(size, 1), image_of(size, 2)
-    refiner = EvidenceRefiner(backend="torch", precision="fp32")
+    refiner = EvidenceRefiner(backend="torch", precision="fp32", passes=passes)
     want = refiner(coarse, left, right=right, scale=1 / step)
     arrays = _resident(coarse, device)
     one, other = _on(device, left, right)
@@ -149,7 +149,8 @@ def test_on_tensors_the_refiner_gives_the_map_of_arrays(size, step, device):
     assert (full.dtype, valid.dtype, sure.dtype) == (torch.float32, torch.uint8, torch.float32)
     assert all(part.is_contiguous() and part.shape == size for part in (full, valid, sure))
     assert valid.data_ptr() != arrays.valid.data_ptr()
-    tolerance = 1e-3 if device == "cpu" else 0.05  # torch's convolutions may have 10 bits on a GPU
+    # Torch's convolutions may have 10 bits on a GPU; and a second pass rounds the map of the first to 1/256 pixel.
+    tolerance = 1e-3 if device == "cpu" and passes == 1 else 0.05
     np.testing.assert_allclose(full.cpu().numpy(), want.disparity, rtol=0, atol=tolerance)
     np.testing.assert_array_equal(valid.cpu().numpy() != 0, want.valid)
     np.testing.assert_allclose(sure.cpu().numpy(), want.confidence, rtol=0, atol=tolerance)

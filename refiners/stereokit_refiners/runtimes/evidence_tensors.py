@@ -67,7 +67,7 @@ class TensorHypotheses(NamedTuple):
 
 
 def weigh_on_device(
-    content: WeightFile, coarse: DeviceDisparity, left: Any, right: Any, step: int, stream: Any
+    content: WeightFile, coarse: DeviceDisparity, left: Any, right: Any, step: int, stream: Any, passes: int = 1
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Refine a map that lies on the GPU by evidence from both images; see `stereokit_refiners.contract.DeviceRefiner`.
 
@@ -81,6 +81,8 @@ def weigh_on_device(
     step : {1, 2, 4}
         Full-size pixels of a coarse pixel.
     stream : numba stream
+    passes : int
+        How often; from the second time on its own map.
 
     Returns
     -------
@@ -92,11 +94,15 @@ def weigh_on_device(
         disparity, candidates, confidence, known, one, other = (torch.as_tensor(array) for array in arrays)
         rows, columns = one.shape
         with torch.inference_mode():
-            values = hypotheses(disparity, candidates, one, other, step)
-            channels = network_input(values, confidence, one, columns)
-            head = module({"evidence": channels[None]})["map"][0]
-            full, sure = mixture(head, values, rows, columns)
-            return full, enlarged(known, step, rows, columns), sure
+            known = enlarged(known, step, rows, columns)
+            for _ in range(passes):
+                values = hypotheses(disparity, candidates, one, other, step)
+                channels = network_input(values, confidence, one, columns)
+                head = module({"evidence": channels[None]})["map"][0]
+                disparity, confidence = mixture(head, values, rows, columns)
+                candidates = torch.stack([enlarged(each, step, rows, columns) * step for each in candidates])
+                step = 1
+            return disparity, known, confidence
 
 
 @lru_cache(maxsize=8)

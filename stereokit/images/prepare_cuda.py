@@ -247,7 +247,7 @@ def halve(
 
 
 def smooth(queue: Queue, images: Any, dtype: np.dtype[Any], sigma: float, shape: tuple[int, int]) -> Any:
-    """Return both images blurred, 16 bit, as `stereokit.images.resize.smooth` does; `sigma` is above 0."""
+    """Return both images blurred, 16 bit, as `stereokit.images.blur.smooth` does; `sigma` is above 0."""
     height, width = shape
     size = 2 * height * width
     weights = queue.cached("smooth.weights", sigma, lambda: gaussian_weights(sigma))

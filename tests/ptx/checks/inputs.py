@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereokit.cuda.kernel import blocks_for
-from stereokit.images import gray, prepare_cuda, resize
+from stereokit.images import blur, gray, prepare_cuda, resize
 
 SHAPES = [(1, 1), (5, 33), (8, 7)]
 
@@ -73,7 +73,7 @@ def check_halved(queue, dtype=np.uint8):
 def check_blurred(queue, dtype=np.uint8, sigmas=(0.3, 0.7, 2.0)):
     for shape, sigma in zip(SHAPES, sigmas, strict=True):
         pair = _pair(shape, dtype)
-        want = resize.smooth(gray.GrayPair(*pair, None, None, pair[0].astype(np.uint8)), sigma)
+        want = blur.smooth(gray.GrayPair(*pair, None, None, pair[0].astype(np.uint8)), sigma)
         out = prepare_cuda.smooth(queue, queue.upload("in", pair), np.dtype(dtype), sigma, shape)
         np.testing.assert_array_equal(queue.fetch(out).reshape(2, *shape), [want.left, want.right])
 

@@ -97,7 +97,9 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 
 
-def _refine(settings: MatchSettings, coarse: Disparity, pair: GrayPair, scale: float, threads: int) -> Disparity:
+def _refine(
+    settings: MatchSettings, coarse: Disparity, pair: GrayPair, scale: float, threads: int, *, for_search: bool = False
+) -> Disparity:
     """Return what the refiner makes of a map; OptionError if that has not the size of the image."""
     refiner: Any = settings.refiner
     keywords: dict[str, Any] = {}
@@ -105,7 +107,8 @@ def _refine(settings: MatchSettings, coarse: Disparity, pair: GrayPair, scale: f
         keywords["scale"] = scale
     if getattr(refiner, "needs_right", False):
         keywords["right"] = pair.right if pair.right.dtype == np.uint8 else scale_guide(pair.right, *pair.span)
-    full: Any = refiner(coarse, pair.guide, threads=threads, **keywords)
+    call = getattr(refiner, "for_search", refiner) if for_search else refiner
+    full: Any = call(coarse, pair.guide, threads=threads, **keywords)
     if not isinstance(full, Disparity) or full.disparity.shape != pair.guide.shape:
         received = full.disparity.shape if isinstance(full, Disparity) else type(full).__name__
         size = pair.guide.shape
@@ -216,7 +219,7 @@ class CpuPipeline:
     def _refined_guide(self, coarse: Disparity, half: GrayPair, levels: Levels, threads: int) -> Disparity:
         """Return the half-size map as the refiner makes it, called measured where it is sure; thin things stay."""
         with span("refine", "refine at half size"):
-            better = _refine(self.settings, coarse, half, 1, threads)
+            better = _refine(self.settings, coarse, half, 1, threads, for_search=True)
         lowest, highest = np.float32(levels.minimum), np.float32(levels.minimum + levels.count - 1)
         disparity = np.clip(better.disparity, lowest, highest)
         disparity = np.where(np.isnan(disparity), coarse.disparity, disparity)

@@ -8,7 +8,9 @@ general one is better, and so it is for crops of a street down to 16x32 pixels (
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from numpy.typing import NDArray
@@ -75,12 +77,17 @@ class AutoRefiner:
 
     def __call__(
         self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
-        threads: int = 1,
+        threads: int = 1, passes: int | None = None,
     ) -> Disparity:  # fmt: skip
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
         if self.general is None or min(left.shape) < SMALLEST:
             return Linear()(coarse, left, scale=scale, threads=threads)
-        return self.general(coarse, left, right=right, scale=scale, threads=threads)
+        return self.general(coarse, left, right=right, scale=scale, threads=threads, passes=passes)
+
+    @property
+    def for_search(self) -> Callable[..., Disparity]:
+        """What refines the half-size map that says where to search."""
+        return partial(self, passes=1)
 
     def on_device(
         self, coarse: DeviceDisparity, left: Any, stream: Any, *, right: Any = None, scale: float = 0.5

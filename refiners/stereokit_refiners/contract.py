@@ -46,8 +46,8 @@ class Refiner(Protocol):
     that is True, and is called with ``scale=``, the size at which was matched: 1, 0.5 or 0.25; rows and columns of
     the coarse map are those of `left` times that, rounded up. One that has both may be called two times for one pair:
     at full size with ``scale=1`` it first refines the pair of half the size, with ``scale=1`` too, whose map tells a
-    search from coarse to fine where to look. One that can work on the GPU has a method
-    ``on_device``, a `DeviceRefiner`, for `stereokit.Matcher.on_device`.
+    search from coarse to fine where to look; what is called then is its ``for_search``, if it has one. One that can
+    work on the GPU has a method ``on_device``, a `DeviceRefiner`, for `stereokit.Matcher.on_device`.
     """
 
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1) -> Disparity:

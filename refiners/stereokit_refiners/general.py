@@ -37,7 +37,8 @@ class EvidenceRefiner(LearnedRefiner):
     passes : int or None
         How often it refines, 1 to 4: from the second time on its own map. Indoors and of near things two passes leave
         up to a tenth fewer errors than one, on roads as many; each takes as long as the first. None is two for maps of
-        the images' size, for which accuracy counts, and else one.
+        the images' size, for which accuracy counts, and else one. The half-size map that says where to search is
+        refined once.
 
     Raises
     ------
@@ -68,16 +69,16 @@ class EvidenceRefiner(LearnedRefiner):
 
     def __call__(
         self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
-        threads: int = 1,
+        threads: int = 1, passes: int | None = None,
     ) -> Disparity:  # fmt: skip
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
         if self.evidence_scale == 1:
-            return super().__call__(coarse, left, right=right, scale=scale, threads=threads)
+            return super().__call__(coarse, left, right=right, scale=scale, threads=threads, passes=passes)
         if scale > self.evidence_scale:
             rule = "evidence_scale must be 1 where the map has more pixels than the images that would be looked at"
             raise OptionError(f"{rule}, got {self.evidence_scale:g} with scale {scale:g}")
         views = halved(left, threads), halved(right_of(left, right), threads)
-        half = super().__call__(coarse, views[0], right=views[1], scale=2 * scale, threads=threads)
+        half = super().__call__(coarse, views[0], right=views[1], scale=2 * scale, threads=threads, passes=passes)
         rows, columns = left.shape
         disparity = upscaled(half.disparity, 2, rows, columns, threads)
         known = enlarged(coarse.valid.view(np.uint8), round(1 / scale), rows, columns).view(np.bool_)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -148,10 +149,11 @@ class LearnedRefiner:
 
     def __call__(
         self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
-        threads: int = 1,
+        threads: int = 1, passes: int | None = None,
     ) -> Disparity:  # fmt: skip
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`.
 
+        A network that weighs values does so `passes` times, from the second time on its own map; None is its usual.
         Where the coarse map is NaN, the result is; the network sees it filled. Networks of half-size maps alone know
         disparities from 0 on:
         one whose map goes below sees it lifted by as much, one whose map begins far above sees it lowered (see
@@ -166,7 +168,9 @@ class LearnedRefiner:
         step = round(1 / scale)
         _check_size(coarse.disparity, left, step)
         if self.any_scale:
-            return self._weighed(coarse, left, right, step, threads)
+            return self._weighed(
+                coarse, left, right, step, threads, self._passes_at(step) if passes is None else passes
+            )
         rows, columns = left.shape
         disparity = coarse.disparity
         unknown = np.isnan(disparity)
@@ -189,6 +193,11 @@ class LearnedRefiner:
             known &= ~missing
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
+
+    @property
+    def for_search(self) -> Callable[..., Disparity]:
+        """What refines the half-size map that says where to search: once, which serves as well there."""
+        return partial(self, passes=1)
 
     def check_runtime(self) -> None:
         """Choose the runtime now rather than at the first map.
@@ -252,7 +261,7 @@ class LearnedRefiner:
             )
 
     def _weighed(
-        self, coarse: Disparity, left: NDArray[Any], right: NDArray[Any] | None, step: int, threads: int
+        self, coarse: Disparity, left: NDArray[Any], right: NDArray[Any] | None, step: int, threads: int, passes: int
     ) -> Disparity:
         """Return the map of a network that weighs values by evidence from both images."""
         rows, columns = left.shape
@@ -263,7 +272,7 @@ class LearnedRefiner:
         if gaps:
             disparity = np.nan_to_num(fill(disparity, "nearest", threads=threads))
         full, sure = self._one_pass(disparity, candidates, confidence, left, other, step, threads)
-        for again in range(1, self._passes_at(step)):
+        for again in range(1, passes):
             if again == 1:
                 candidates = np.stack([enlarged(one, step, rows, columns) * np.float32(step) for one in candidates])
             full, sure = self._one_pass(full, candidates, sure, left, other, 1, threads)

@@ -10,6 +10,7 @@ import pytest
 import stereokit
 from stereokit.errors import DeviceError, OptionError
 from stereokit.images.resize import halved
+from stereokit_refiners.auto import AutoRefiner
 from stereokit_refiners.general import EvidenceRefiner
 from stereokit_refiners.linear import Linear
 from stereokit_refiners.weights import read, shipped, write
@@ -120,3 +121,33 @@ def test_a_number_of_passes_that_cannot_be_is_refused():
     assert pickle.loads(pickle.dumps(EvidenceRefiner(passes=3))).passes == 3
     prints = [EvidenceRefiner(passes=passes).fingerprint for passes in (None, 1, 2)]
     assert len(set(prints)) == 3
+
+
+def test_the_map_that_says_where_to_search_is_refined_once():
+    left, right = images(64, 96)
+    coarse = coarse_map(64, 96)
+    for refiner in (EvidenceRefiner(precision="fp32"), AutoRefiner(precision="fp32")):
+        searching = refiner.for_search(coarse, left, right=right, scale=1)
+        once = EvidenceRefiner(precision="fp32", passes=1)(coarse, left, right=right, scale=1)
+        np.testing.assert_array_equal(searching.disparity, once.disparity)
+        assert not np.array_equal(refiner(coarse, left, right=right, scale=1).disparity, once.disparity)
+
+
+def test_a_match_from_coarse_to_fine_asks_for_it():
+    left, right = images(64, 160)
+    calls = []
+
+    class Watched:
+        needs_candidates = needs_confidence = needs_right = any_scale = True
+
+        def __call__(self, coarse, left, **keywords):
+            calls.append(("full", left.shape))
+            return Linear()(coarse, left, scale=1)
+
+        def for_search(self, coarse, left, **keywords):
+            calls.append(("search", left.shape))
+            return Linear()(coarse, left, scale=1)
+
+    options = {"max_disparity": 96, "search": "coarse-to-fine", "device": "cpu"}
+    stereokit.Matcher("S2", scale=1, refiner=Watched(), **options)(left, right)
+    assert calls == [("search", (32, 80)), ("full", (64, 160))]

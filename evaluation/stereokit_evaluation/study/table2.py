@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any
 
 from rich.console import Console
 
+from stereokit import Matcher
 from stereokit.kernels.trace import observed
 from stereokit_evaluation.bench.baselines import BASELINES, HH, THREE_WAY, Call, opencv_threads
 from stereokit_evaluation.bench.stages import GROUPS, StageTimer
 from stereokit_evaluation.bench.table import format_ms, new_table
 from stereokit_evaluation.bench.timing import Spread, round_robin, spread
 from stereokit_evaluation.common.sizes import Size
+from stereokit_evaluation.common.weights import is_of_half_size
 from stereokit_evaluation.data import published
 from stereokit_evaluation.scoring.runner import Matching
 from stereokit_evaluation.study.configurations import Configuration, available_variants, build, describe_error
@@ -99,7 +101,7 @@ def time_pipeline(
     with_baselines : bool
         OpenCV's 3WAY and HH too.
     runtimes : str or None
-        A refiner that is timed in each runtime and precision too.
+        A refiner that is timed in each runtime and precision too; the general one at other sizes as well.
     weights : str or None
         Of the refiners that come without.
     step : callable
@@ -140,7 +142,27 @@ def _configurations(
             configurations += [
                 (f", {backend} {precision}", c) for c in build(methods, [str(runtimes)], runtime_options)
             ]
+    if runtimes is not None and not is_of_half_size(runtimes):
+        configurations += _of_other_sizes(build(methods, [runtimes], options), options)
     return configurations
+
+
+def _of_other_sizes(
+    configurations: Sequence[Configuration], options: Mapping[str, Any]
+) -> list[tuple[str, Configuration]]:
+    """Return what the general refiner does at other sizes than half, with what the names of these end in."""
+    more: dict[str, dict[str, Any]] = {
+        ", full size": {"scale": 1},
+        ", full size, one pass": {"scale": 1, "passes": 1},
+        ", a quarter of the size": {"scale": 0.25},
+        ", a quarter, evidence_scale=0.5": {"scale": 0.25, "evidence_scale": 0.5},
+    }
+    return [
+        (ending, replace(c, matcher=Matcher(c.method, refiner=c.variant, **options, **its_options)))
+        for ending, its_options in more.items()
+        for c in configurations
+        if c.missing is None
+    ]
 
 
 def as_json(rows: Sequence[PipelineRow]) -> list[dict[str, Any]]:

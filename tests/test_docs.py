@@ -250,7 +250,7 @@ def public_modules() -> set[str]:
 
 INTERNAL = re.compile(
     r"stereokit\.(kernels|cuda|images|methods|io\.|cli\.(?!app))"
-    r"|stereokit_refiners\.runtimes\.(openvino|onnx|onnx_file|opencv|torch|reference|evidence|mixture)"
+    r"|stereokit_refiners\.runtimes\.(?!tensors|encode)"
     r"|stereokit\.aggregation\.paths"
     r"|stereokit_evaluation\.(commands\.(?!search)|common|bench\.|gpu_model\.(sass|work|table)|synthetic\.(?!scenes|generated|assets))"
     r"|.*_cuda$"

@@ -14,7 +14,7 @@ def test_channels_come_to_lie_together(shape, threads):
     channels, rows, columns = shape
     innermost = np.random.default_rng(0).integers(-128, 128, (rows, columns, channels), dtype=np.int8)
     array = np.moveaxis(innermost, 2, 0)
-    for given in (array, np.ascontiguousarray(array), array[:, ::-1], array.astype(np.float32)):
-        out = planar(given, threads)
+    for each in (array, np.ascontiguousarray(array), array[:, ::-1], array.astype(np.float32)):
+        out = planar(each, threads)
         assert out.dtype == np.float32 and out.flags.c_contiguous and out.flags.writeable
-        np.testing.assert_array_equal(out, given[None])
+        np.testing.assert_array_equal(out, each[None])

@@ -50,6 +50,8 @@ class StageOptions(TypedDict, total=False):
     weights: str | None
     backend: str
     precision: str
+    evidence_scale: float
+    passes: int | None
 
 
 class WarmupOptions(StageOptions, total=False):

@@ -51,7 +51,7 @@ class StageOptions(TypedDict, total=False):
     backend: str
     precision: str
     evidence_scale: float
-    passes: int | None
+    refinements: int | None
 
 
 class WarmupOptions(StageOptions, total=False):

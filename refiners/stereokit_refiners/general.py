@@ -1,4 +1,4 @@
-"""The general refiner: the network `stereokit_refiners.networks.evidence`, on one or more sizes and passes."""
+"""The general refiner: the network `stereokit_refiners.networks.evidence`, at several sizes, once or more often."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["EvidenceRefiner"]
 
-_MOST_PASSES = 4
+_MOST_REFINEMENTS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,8 @@ class EvidenceRefiner(LearnedRefiner):
     evidence_scale : {1, 0.5}
         Size of the images that are looked at. With 0.5 it refines a map of a quarter or half of the size up to half
         size, and upscales that linearly: in less than half of the time, with errors between its own and linear ones.
-    passes : int or None
-        How often it refines, 1 to 4: from the second time on its own map. Indoors and of near things two passes leave
+    refinements : int or None
+        How often it refines, 1 to 4: from the second time on its own map. Indoors and of near things two leave
         up to a tenth fewer errors than one, on roads as many; each takes as long as the first. None is two for maps of
         the images' size, for which accuracy counts, and else one. The half-size map that says where to search is
         refined once.
@@ -47,25 +47,25 @@ class EvidenceRefiner(LearnedRefiner):
     """
 
     evidence_scale: float = 1
-    passes: int | None = None
+    refinements: int | None = None
     architecture: ClassVar[str] = "evidence"
     of_half_size: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if isinstance(self.evidence_scale, bool) or self.evidence_scale not in (1, 0.5):
             raise OptionError(f"evidence_scale must be 1 or 0.5, got {self.evidence_scale!r}")
-        if self.passes is not None:
-            object.__setattr__(self, "passes", check_integer("passes", self.passes, 1, _MOST_PASSES))
+        if self.refinements is not None:
+            object.__setattr__(self, "refinements", check_integer("refinements", self.refinements, 1, _MOST_REFINEMENTS))
         super().__post_init__()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "evidence_scale": self.evidence_scale, "passes": self.passes}
+        return {**super().__getstate__(), "evidence_scale": self.evidence_scale, "refinements": self.refinements}
 
     @property
     def fingerprint(self) -> str:
         """What the result depends on, beside the inputs."""
         scale = "" if self.evidence_scale == 1 else f"-{self.evidence_scale:g}"
-        return super().fingerprint + scale + ("" if self.passes is None else f"-x{self.passes}")
+        return super().fingerprint + scale + ("" if self.refinements is None else f"-x{self.refinements}")
 
     def __call__(
         self, coarse: Disparity, left: NDArray[Any], *, right: NDArray[Any] | None = None, scale: float = 0.5,
@@ -89,7 +89,7 @@ class EvidenceRefiner(LearnedRefiner):
 
     def _passes_at(self, step: int) -> int:
         """Return how often a map is refined, whose pixels are so many of the images' that are looked at."""
-        return super()._passes_at(step) if self.passes is None else self.passes
+        return super()._passes_at(step) if self.refinements is None else self.refinements
 
     def on_device(
         self, coarse: DeviceDisparity, left: Any, stream: Any, *, right: Any = None, scale: float = 0.5

@@ -153,10 +153,20 @@ def test_levels_hold_the_largest_disparity(farthest, levels):
         (["--refiner", "cnn", "--streets", 2, "--assets", "."], ["assets must come with generated pairs", "'.'"]),
         (["--refiner", "cnn", "--generated", 2, "--assets", "none"], ["assets must be a folder", "none"]),
         (["--refiner", "stereokit", "--generated", 2, "--assets", "none"], ["assets must be a folder", "none"]),
+        (["--refiner", "stereokit", "--generated", 2, "--preset", "paper"], ["preset must be default", "'paper'"]),
         (["--refiner", "cnn", "--generated", -1], ["generated must be at least 0", "-1"]),
         (["--refiner", "cnn"], ["dataset, extra, streets or generated"]),
     ],
 )
 def test_bad_options_end_with_one_line(words, parts, tmp_path):
     failed(run("-o", tmp_path / "out", *words), *parts)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("refiner", ["cnn", "stereokit"])
+def test_assets_without_a_picture_leave_nothing_behind(refiner, tmp_path):
+    assets = tmp_path / "assets"
+    assets.mkdir()
+    (assets / "readme.txt").write_text("none")
+    failed(run("-o", tmp_path / "out", "--refiner", refiner, "--generated", 2, "--assets", assets), "assets must hold")
     assert not (tmp_path / "out").exists()

@@ -91,14 +91,14 @@ def test_what_cannot_be_is_refused_in_one_line():
 
 
 @pytest.mark.parametrize(("scale", "evidence_scale"), [(1, 1), (0.5, 1), (0.25, 1), (0.25, 0.5)])
-def test_a_second_pass_refines_the_first_ones_map(scale, evidence_scale):
+def test_a_second_refinement_is_of_the_first_ones_map(scale, evidence_scale):
     size = (53, 75)
     left, right = images(*size)
     step = round(1 / scale)
     coarse = coarse_map(-(-size[0] // step), -(-size[1] // step))
-    twice = EvidenceRefiner(precision="fp32", evidence_scale=evidence_scale, passes=2)
+    twice = EvidenceRefiner(precision="fp32", evidence_scale=evidence_scale, refinements=2)
     actual = twice(coarse, left, right=right, scale=scale)
-    once = EvidenceRefiner(precision="fp32", passes=1)
+    once = EvidenceRefiner(precision="fp32", refinements=1)
     views, step = (left, right), round(evidence_scale / scale)
     if evidence_scale == 0.5:
         views = halved(left), halved(right)
@@ -114,12 +114,12 @@ def test_a_second_pass_refines_the_first_ones_map(scale, evidence_scale):
     assert np.array_equal(usual.disparity, actual.disparity) == (scale == evidence_scale)
 
 
-def test_a_number_of_passes_that_cannot_be_is_refused():
+def test_a_number_of_refinements_that_cannot_be_is_refused():
     for value in (0, 5, 1.5, True):
-        with pytest.raises(OptionError, match="passes"):
-            EvidenceRefiner(passes=value)
-    assert pickle.loads(pickle.dumps(EvidenceRefiner(passes=3))).passes == 3
-    prints = [EvidenceRefiner(passes=passes).fingerprint for passes in (None, 1, 2)]
+        with pytest.raises(OptionError, match=r"^refinements must be"):
+            EvidenceRefiner(refinements=value)
+    assert pickle.loads(pickle.dumps(EvidenceRefiner(refinements=3))).refinements == 3
+    prints = [EvidenceRefiner(refinements=count).fingerprint for count in (None, 1, 2)]
     assert len(set(prints)) == 3
 
 
@@ -128,7 +128,7 @@ def test_the_map_that_says_where_to_search_is_refined_once():
     coarse = coarse_map(64, 96)
     for refiner in (EvidenceRefiner(precision="fp32"), AutoRefiner(precision="fp32")):
         searching = refiner.for_search(coarse, left, right=right, scale=1)
-        once = EvidenceRefiner(precision="fp32", passes=1)(coarse, left, right=right, scale=1)
+        once = EvidenceRefiner(precision="fp32", refinements=1)(coarse, left, right=right, scale=1)
         np.testing.assert_array_equal(searching.disparity, once.disparity)
         assert not np.array_equal(refiner(coarse, left, right=right, scale=1).disparity, once.disparity)
 

@@ -141,7 +141,7 @@ def test_the_mixture_is_the_same_but_for_exponentials(step, device):
 @pytest.mark.parametrize("size", [(16, 16), (61, 75), (96, 128)])
 def test_on_tensors_the_refiner_gives_the_map_of_arrays(size, step, passes, device):
     coarse, left, right = _coarse(size, step, -4, 30, seed=3), image_of(size, 1), image_of(size, 2)
-    refiner = EvidenceRefiner(backend="torch", precision="fp32", passes=passes)
+    refiner = EvidenceRefiner(backend="torch", precision="fp32", refinements=passes)
     want = refiner(coarse, left, right=right, scale=1 / step)
     arrays = _resident(coarse, device)
     one, other = _on(device, left, right)

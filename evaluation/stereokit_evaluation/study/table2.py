@@ -153,7 +153,7 @@ def _of_other_sizes(
     """Return what the general refiner does at other sizes than half, with what the names of these end in."""
     more: dict[str, dict[str, Any]] = {
         ", full size": {"scale": 1},
-        ", full size, one pass": {"scale": 1, "passes": 1},
+        ", full size, refinements=1": {"scale": 1, "refinements": 1},
         ", a quarter of the size": {"scale": 0.25},
         ", a quarter, evidence_scale=0.5": {"scale": 0.25, "evidence_scale": 0.5},
     }

@@ -94,7 +94,7 @@ def _model(path: Path) -> Model:
 
 
 def check_assets(folder: Path) -> None:
-    """Refuse assets that are no folder.
+    """Refuse assets that are no folder, or one in which no name is that of a photograph or a model.
 
     Raises
     ------
@@ -102,6 +102,8 @@ def check_assets(folder: Path) -> None:
     """
     if not folder.is_dir():
         raise OptionError(f"assets must be a folder, got {str(folder)!r}")
+    if not any(_suffix(path.name) in (*_PHOTOGRAPHS, *MODEL_SUFFIXES) for path in folder.rglob("*")):
+        raise OptionError(_none_in(folder))
 
 
 def read_assets(folder: Path, cache: Path, step: Callable[[str], object] | None = None) -> Assets:
@@ -159,15 +161,19 @@ def read_assets(folder: Path, cache: Path, step: Callable[[str], object] | None 
     photographs = tuple(name for name in files if _suffix(name) in _PHOTOGRAPHS)
     shapes = tuple(name for name in files if _suffix(name) in MODEL_SUFFIXES)
     if not files:
-        raise OptionError(
-            f"assets must hold photographs (PNG, JPEG, {_LEAST} pixels and up) or models (OBJ, GLB, glTF) that can be "
-            f"read, got none in {str(folder)!r}"
-        )
+        raise OptionError(_none_in(folder))
     others = f"; {small} pictures are too small or of one tone, and are no textures" if small else ""
     say(f"assets: {len(photographs)} photographs, {len(shapes)} models{others}")
     digest = hashlib.sha256(json.dumps(sorted(contents.items())).encode()).hexdigest()[:12]
     terms = _terms(folder)
     return Assets(photographs, shapes, digest, dict(Counter(terms.get(name, "not stated") for name in files)), files)
+
+
+def _none_in(folder: Path) -> str:
+    return (
+        f"assets must hold photographs (PNG, JPEG, {_LEAST} pixels and up) or models (OBJ, GLB, glTF) that can be "
+        f"read, got none in {str(folder)!r}"
+    )
 
 
 def _suffix(name: str) -> str:

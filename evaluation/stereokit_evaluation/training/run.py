@@ -88,10 +88,12 @@ def run_training(
     check_integer("generated", generated, 0)
     if general and streets:
         raise OptionError(f"streets must be 0 for refiner {refiner!r}, whose generated pairs hold some, got {streets}")
+    if general and preset != "default":
+        raise OptionError(f"preset must be default for refiner {refiner!r}, got {preset!r}")
     if assets is not None:
-        check_assets(assets)
         if generated < 1:
             raise OptionError(f"assets must come with generated pairs, got {str(assets)!r} and none of them")
+        check_assets(assets)
     from stereokit_refiners.networks.layers import output_rule
     from stereokit_refiners.training.loop import Source
     from stereokit_refiners.training.samples import SampleFiles, store_variant

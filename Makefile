@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-KERNEL_TESTS := sgm dt costs wta postprocess simd properties search
+KERNEL_TESTS := $(addprefix stereokit/test_, sgm dt costs wta postprocess simd properties search) refiners/test_evidence
 
 define MATCH_A_PAIR
 import sys, cv2, numpy as np, stereokit
@@ -39,7 +39,7 @@ test: $(VENV)/.dev  ## all tests, two files at a time
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 checked: $(VENV)/.dev  ## tests that drive the CPU's kernels, in a build that checks every access to an array
-	STEREOKIT_CHECKED=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(KERNEL_TESTS:%=tests/stereokit/test_%.py)
+	STEREOKIT_CHECKED=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(KERNEL_TESTS:%=tests/%.py)
 
 fuzz: $(VENV)/.dev  ## generated calls and mutated files, ten minutes; FUZZ="--seed 2 --minutes 1" for others
 	cd tests && ../$(BIN)/python -m fuzz $(FUZZ)

@@ -92,7 +92,7 @@ def refined(settings: MatchSettings, coarse: Disparity, pair: GrayPair, threads:
     disparity = full.disparity
     if settings.bounds is not None:
         low, high = settings.bounds
-        own = disparity if disparity.flags.writeable else None  # what a refiner returns is its own no more
+        own = disparity if getattr(settings.refiner, "maps_are_new", False) else None
         disparity = np.clip(disparity, np.float32(low), np.float32(high), out=own)
     return Disparity(disparity, full.valid, full.confidence if settings.confidence else None)
 

@@ -171,6 +171,8 @@ class MatchSettings:
             options = {k: v for k, v in options.items() if k not in refiner_options}
             if scale != 0.5 and not getattr(refine, "any_scale", False):
                 raise OptionError(f"refiner {refiner_name!r} needs scale=0.5, got scale={scale:g}")
+            if hasattr(refine, "check_scale"):
+                refine.check_scale(scale)
         cost_name, aggregation_name = method.split("+")
         make_cost, make_aggregation = COSTS.get(cost_name), AGGREGATIONS.get(aggregation_name)
         cost_names, aggregation_names = option_names(make_cost), option_names(make_aggregation)

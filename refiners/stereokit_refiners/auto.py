@@ -48,6 +48,7 @@ class AutoRefiner:
     backend: str = "auto"
     precision: str = "auto"
     any_scale: ClassVar[bool] = True
+    maps_are_new: ClassVar[bool] = True
     general: EvidenceRefiner | None = field(init=False, repr=False)
     """None where it cannot run."""
 
@@ -83,6 +84,11 @@ class AutoRefiner:
         if self.general is None or min(left.shape) < SMALLEST:
             return Linear()(coarse, left, scale=scale, threads=threads)
         return self.general(coarse, left, right=right, scale=scale, threads=threads, passes=passes)
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        """What refining takes at most."""
+        return Linear.bytes_per_pixel if self.general is None else self.general.bytes_per_pixel
 
     @property
     def for_search(self) -> Callable[..., Disparity]:

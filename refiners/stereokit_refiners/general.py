@@ -36,8 +36,8 @@ class EvidenceRefiner(LearnedRefiner):
         size, and upscales that linearly: in less than half of the time, with errors between its own and linear ones.
     refinements : int or None
         How often it refines, 1 to 4: from the second time on its own map. Indoors and of near things two leave
-        up to a tenth fewer errors than one, on roads as many; each takes as long as the first. None is two for maps of
-        the images' size, for which accuracy counts, and else one. The half-size map that says where to search is
+        up to a tenth fewer errors than one, on roads as many; each takes as long as the first. None is two with ``scale=1``,
+        where accuracy counts, and else one. The half-size map that says where to search is
         refined once.
 
     Raises
@@ -74,10 +74,9 @@ class EvidenceRefiner(LearnedRefiner):
         """Return the refined map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""
         if self.evidence_scale == 1:
             return super().__call__(coarse, left, right=right, scale=scale, threads=threads, passes=passes)
-        if scale > self.evidence_scale:
-            rule = "evidence_scale must be 1 where the map has more pixels than the images that would be looked at"
-            raise OptionError(f"{rule}, got {self.evidence_scale:g} with scale {scale:g}")
+        self.check_scale(scale)
         views = halved(left, threads), halved(right_of(left, right), threads)
+        passes = (self.refinements or 1) if passes is None else passes
         half = super().__call__(coarse, views[0], right=views[1], scale=2 * scale, threads=threads, passes=passes)
         rows, columns = left.shape
         disparity = upscaled(half.disparity, 2, rows, columns, threads)
@@ -86,6 +85,11 @@ class EvidenceRefiner(LearnedRefiner):
             known &= ~np.isnan(disparity)
         assert half.confidence is not None
         return Disparity(disparity, known, upscaled(half.confidence, 1, rows, columns, threads))
+
+    def check_scale(self, scale: float) -> None:
+        """Raise OptionError if maps of this size cannot be refined."""
+        if scale > self.evidence_scale:
+            raise OptionError(f"evidence_scale must be 1 with scale={scale:g}, got {self.evidence_scale:g}")
 
     def _passes_at(self, step: int) -> int:
         """Return how often a map is refined, whose pixels are so many of the images' that are looked at."""

@@ -69,6 +69,8 @@ class LearnedRefiner:
     backend: str = "auto"
     precision: str = "auto"
     architecture: ClassVar[str] = ""
+    maps_are_new: ClassVar[bool] = True
+    """Whether the matcher may write to the maps that it returns."""
     of_half_size: ClassVar[bool] = True
     """Whether it is one of half-size maps alone: commands give their option for weights to these first."""
     _file: WeightFile = field(init=False, repr=False, compare=False)
@@ -193,6 +195,11 @@ class LearnedRefiner:
             known &= ~missing
         sure = None if coarse.confidence is None else doubled(coarse.confidence, rows, columns)
         return Disparity(full, known, sure)
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        """What refining takes at most, with buffers for four sizes of images: measured with the general network."""
+        return 240 if self._compiled.backend == "openvino" else 430
 
     @property
     def for_search(self) -> Callable[..., Disparity]:

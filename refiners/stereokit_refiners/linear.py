@@ -32,6 +32,7 @@ class Linear:
     """Bilinear upscaling; the left image is used for its size only."""
 
     any_scale: ClassVar[bool] = True
+    bytes_per_pixel: ClassVar[int] = 12
 
     def __call__(self, coarse: Disparity, left: NDArray[Any], *, threads: int = 1, scale: float = 0.5) -> Disparity:
         """Return the map at the size of `left`; see `stereokit_refiners.contract.Refiner`."""

@@ -1,7 +1,7 @@
 """Weight files: safetensors, checked against the architecture, never code.
 
 A file holds the float32 arrays of one network and, as metadata, the format's version, the architecture, its output
-mode, the ranges for int8 and how it was trained. Those of the general refiner are in ``weights/`` beside this file.
+mode, the ranges for int8 and how it was trained. Those that come with the package are in ``weights/`` beside this file.
 Other distributions bring collections, packages with a file for each network, and announce them in the entry-point group
 ``stereokit.weights``.
 """

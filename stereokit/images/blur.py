@@ -71,11 +71,12 @@ def smooth(
     weights = gaussian_weights(sigma)[gaussian_weights(sigma).size // 2 :]
     blurred, tasks = [], []
     for side, image in (("left", pair.left), ("right", pair.right)):
+        image = np.ascontiguousarray(image)
         out = buffers.array(f"smooth.{side}", (height, width), np.uint16)
         for k, (y0, y1) in enumerate(spans(height, threads)):
             line = buffers.array(f"smooth.{side}.line{k}", width + 2 * (weights.size - 1), np.uint32)
             total = buffers.array(f"smooth.{side}.total{k}", width, np.uint64)
-            tasks.append(partial(_blur, np.ascontiguousarray(image), weights, y0, y1, line, total, out))
+            tasks.append(partial(_blur, image, weights, y0, y1, line, total, out))
         blurred.append(out)
     run(tasks, threads)
     left, right = ((image + np.uint16(128) >> 8).astype(np.uint8) if eight_bits else image for image in blurred)

@@ -38,7 +38,8 @@ CHECKED = os.environ.get("STEREOKIT_CHECKED", "0") not in ("", "0")
 
 
 _ROOT = Path(__file__).parents[1]
-_IMPORT = re.compile(rb"^ *from (\w[.\w]*) +import +(\([^)]*\)|[^\n]*)", re.MULTILINE)
+_FROM = re.compile(rb"^ *from ([.\w]+) +import +(\([^)]*\)|[^\n]*)", re.MULTILINE)
+_IMPORT = re.compile(rb"^ *import +([^\n]+)", re.MULTILINE)
 
 
 def _digest(paths: Iterable[Path]) -> str:
@@ -48,51 +49,67 @@ def _digest(paths: Iterable[Path]) -> str:
     return digest.hexdigest()[:12]
 
 
-def _folder(package: str) -> Path | None:
-    """Return the folder of a package that is being imported, or None for what is none."""
-    if package == _ROOT.name:
-        return _ROOT
-    places = getattr(sys.modules.get(package), "__path__", ())
-    return next((Path(place) for place in places), None)
+def _modules_below(folder: Path) -> list[Path]:
+    """Return the modules of a package; an editor's lock files, which begin with a dot, are none."""
+    return [path for path in folder.rglob("*.py") if not path.name.startswith(".") and path.is_file()]
 
 
-def _imports(path: Path, folders: Iterable[Path]) -> set[Path]:
-    """Return the modules in these folders of packages that a module imports; what names nothing of them adds none."""
+def _places(module: str, path: Path) -> list[Path]:
+    """Return where a module may lie that a file imports: in this package, its own, or its own folder."""
+    levels = len(module) - len(module.lstrip("."))
+    parts = [part for part in module.split(".") if part]
+    if levels or not parts:
+        return [parent.joinpath(*parts) for parent in list(path.parents)[levels - 1 : levels]]
+    if parts[0] == _ROOT.name:
+        return [_ROOT.joinpath(*parts[1:])]
+    package = [Path(place) for place in getattr(sys.modules.get(parts[0]), "__path__", ())]
+    own = package if any(path.is_relative_to(place) for place in package) else []
+    return [path.parent.joinpath(*parts), *(place.joinpath(*parts[1:]) for place in own)]
+
+
+@lru_cache(maxsize=1024)
+def _imports(path: Path) -> frozenset[Path]:
+    """Return the modules that a module imports, of this package, its own, and its own folder."""
+    text = path.read_bytes()
     files: set[Path] = set()
-    roots = {folder.name: folder for folder in folders}
-    for module, names in _IMPORT.findall(path.read_bytes()):
-        package, *inner = module.decode().split(".")
-        if package in roots:
-            place = roots[package].joinpath(*inner)
-            places = [place, *(place / name for name in re.findall(r"\w+", names.decode()))]
-            files |= {file for each in places for file in (each.with_suffix(".py"), each / "__init__.py")}
-    return {file for file in files if file.is_file()}
+    wanted = [(module.decode(), names.decode()) for module, names in _FROM.findall(text)]
+    for line in _IMPORT.findall(text):
+        wanted += [(name.split(" as ")[0].strip(), "") for name in line.decode().split(",")]
+    for module, names in wanted:
+        if re.fullmatch(r"\.*[\w.]*", module):
+            for place in _places(module, path):
+                each = [place, *(place / name for name in re.findall(r"\w+", names))]
+                files |= {file for one in each for file in (one.with_suffix(".py"), one / "__init__.py")}
+    return frozenset(file for file in files if file.is_file())
 
 
-def kernel_sources(package: str = _ROOT.name) -> set[Path]:
-    """Return the modules that compiled code of a package may depend on.
-
-    They are those that use `stereokit.kernels`, and what they import of the package and of this one.
-    """
-    folder = _folder(package)
-    folders = {_ROOT} if folder is None else {_ROOT, folder}
+def _with_imports(paths: Iterable[Path]) -> set[Path]:
     sources: set[Path] = set()
-    modules = set() if folder is None else set(folder.rglob("*.py"))
-    waiting = {path for path in modules if b"stereokit.kernels.jit" in path.read_bytes()}
+    waiting = set(paths)
     while waiting:
         sources |= waiting
-        waiting = set().union(*(_imports(path, folders) for path in waiting)) - sources
+        waiting = set().union(*map(_imports, waiting)) - sources
     return sources
 
 
-FINGERPRINT = _digest(_ROOT.rglob("*.py"))
+@lru_cache(maxsize=1)
+def kernel_sources() -> frozenset[Path]:
+    """Return the modules that this package's compiled code may depend on: those with kernels, and their imports."""
+    return frozenset(
+        _with_imports(path for path in _modules_below(_ROOT) if b"stereokit.kernels.jit" in path.read_bytes())
+    )
+
+
+FINGERPRINT = _digest(_modules_below(_ROOT))
 """A digest of the package's source: it changes with anything that a result may depend on."""
 
 
-@lru_cache
-def _stamp(package: str) -> str:
-    """Return a digest of what kernels of a package may depend on; of one module alone numba looks at that itself."""
-    return _digest(kernel_sources(_ROOT.name) | kernel_sources(package))
+@lru_cache(maxsize=1024)
+def _stamp(file: str) -> str:
+    """Return a digest of what the kernels of a file may depend on."""
+    path = Path(file)
+    own = set() if path.is_relative_to(_ROOT) or not path.is_file() else _with_imports([path])
+    return _digest(kernel_sources() | own)
 
 
 # Without numba's runtime (``_nrt``) no array is counted in and out of every helper, which costs more than the work of
@@ -106,7 +123,7 @@ _FLAGS: dict[str, Any] = {
 
 def kernel(function: F) -> F:
     """Compile `function` as a kernel that Python code calls."""
-    function.__qualname__ = f"{function.__qualname__}_{_stamp(function.__module__.partition('.')[0])}"
+    function.__qualname__ = f"{function.__qualname__}_{_stamp(function.__code__.co_filename)}"
     compiled: F = numba.njit(**_FLAGS)(function)
     if hasattr(compiled, "_cache"):  # not where NUMBA_DISABLE_JIT is set
         compiled._cache = cache_of(function)

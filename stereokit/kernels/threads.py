@@ -218,6 +218,8 @@ class Team:
 
     def summon(self, members: int | None = None) -> None:
         """Call so many members that are not here, or all: to wake a thread takes longer than many a stage does."""
+        if runner() is not None:
+            return
         words = self._words
         for k in range(1, len(words) if members is None else members):
             if words[k] == _ABSENT:

@@ -226,7 +226,5 @@ def _plan(
 
 
 def _refiner_nbytes(matcher: Matcher) -> int:
-    """Return the bytes per pixel of a refiner, without the matcher's buffers; measured, see the tests."""
-    if matcher.refiner is None:
-        return 0
-    return 12 if matcher.refiner == "linear" else 200
+    """Return the bytes per pixel of a refiner, without the matcher's buffers."""
+    return 0 if matcher.refine is None else int(getattr(matcher.refine, "bytes_per_pixel", 240))

@@ -195,31 +195,48 @@ def test_names_of_kernels_change_with_what_is_compiled_and_nothing_else():
     assert not sources & {"matching.py", "calibration.py", "cli/match.py", "result.py"}
 
 
-def test_kernels_of_another_package_change_with_its_helpers_and_constants(tmp_path, monkeypatch):
+HELPER = "from stereokit.kernels.jit import inline\n@inline\ndef times(x):\n    return {} * x\n"
+KERNEL = "\n@kernel\ndef made(x):\n    return FACTOR * times(x)\n"
+CALL = "from {} import made; print(made(7), made.__qualname__)"
+
+
+@pytest.mark.parametrize(
+    ("name", "imports"),
+    [
+        ("others/kernels.py", "from others.constants import FACTOR\nfrom others.helpers import times"),
+        ("others/kernels.py", "from .constants import FACTOR\nfrom .helpers import times"),
+        (
+            "others/inner/kernels.py",
+            "from ..constants import FACTOR\nfrom others import helpers as h\ntimes = h.times",
+        ),
+        (
+            "others/kernels.py",
+            "import others.constants as c\nimport os, others.helpers as h\nFACTOR = c.FACTOR; times = h.times",
+        ),
+        ("mine.py", "from constants import FACTOR\nfrom helpers import times"),
+    ],
+)
+def test_kernels_of_others_change_with_their_helpers_and_constants(name, imports, tmp_path):
     """Numba looks at the file of the kernel itself; what is compiled into it may stand in others."""
-    package = tmp_path / "others"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "constants.py").write_text("FACTOR = 3\n")
-    helper = "from stereokit.kernels.jit import inline\n@inline\ndef times(x):\n    return {} * x\n"
-    (package / "helpers.py").write_text(helper.format(2))
-    (package / "unused.py").write_text("UNUSED = 1\n")
-    (package / "kernels.py").write_text(
-        "from stereokit.kernels.jit import kernel\nfrom others.constants import FACTOR\n"
-        "from others.helpers import times\n@kernel\ndef triple(x):\n    return FACTOR * times(x)\n"
-    )
-    call = "from others.kernels import triple; print(triple(7), triple.__qualname__)"
+    path = tmp_path / name
+    package = tmp_path / "others" if "/" in name else tmp_path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if "/" in name:
+        for folder in {package, path.parent}:
+            (folder / "__init__.py").write_text("")
+        (package / ".#kernels.py").symlink_to("nobody@host:1")  # an editor's lock file
+    path.write_text(f"from stereokit.kernels.jit import kernel\n{imports}\n{KERNEL}")
+    module = name.removesuffix(".py").replace("/", ".")
 
-    def run():
+    def run(factor, times, unused=0):
+        (package / "constants.py").write_text(f"FACTOR = {factor}\n")
+        (package / "helpers.py").write_text(HELPER.format(times))
+        (package / "unused.py").write_text(f"UNUSED = {unused}\n")
         environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        done = subprocess.run([sys.executable, "-c", call], env=environment, capture_output=True, text=True, check=True)
-        return done.stdout.split()
+        call = [sys.executable, "-c", CALL.format(module)]
+        return subprocess.run(call, env=environment, capture_output=True, text=True, check=True).stdout.split()
 
-    first = run()
-    assert first[0] == "42" and run() == first
-    (package / "unused.py").write_text("UNUSED = 2\n")
-    assert run() == first
-    (package / "helpers.py").write_text(helper.format(5))
-    assert run()[0] == "105"
-    (package / "constants.py").write_text("FACTOR = 1\n")
-    assert run()[0] == "35"
+    first = run(3, 2)
+    assert first[0] == "42" and run(3, 2, unused=1) == first
+    assert run(3, 5)[0] == "105"
+    assert run(1, 5)[0] == "35"

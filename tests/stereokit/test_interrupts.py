@@ -169,6 +169,32 @@ def test_a_helper_whose_caller_is_gone_leaves():
     team.close()
 
 
+def awaited(condition):
+    until = time.monotonic() + 60
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.001)
+    return condition()
+
+
+def test_helpers_that_are_called_early_are_there_and_go_with_the_team():
+    begun = threading.Event()
+    with workers.team(2) as members:
+        members.summon()
+        assert members._words[1] == workers._CALLED
+        members.run([[lambda: begun.wait(60), begun.set]])  # takes two
+    assert begun.is_set() and awaited(lambda: (members._words[1:] == workers._ABSENT).all())
+    with pytest.raises(stereokit.InputError), workers.team(2) as members:
+        Matcher("S2", max_disparity=8, threads=2)(np.zeros((4, 5), np.uint8), np.zeros((4, 6), np.uint8))
+    assert awaited(lambda: (members._words[1:] == workers._ABSENT).all())
+
+
+def test_a_match_calls_its_helpers_before_it_looks_at_the_images(monkeypatch):
+    calls = []
+    monkeypatch.setattr(workers.Team, "summon", lambda self, members=None: calls.append(members))
+    Matcher("S2", max_disparity=8, threads=2)(*pair_of(0))
+    assert calls[0] is None
+
+
 def test_calls_end_where_all_workers_are_busy_or_none_can_be_had(monkeypatch):
     pairs = [pair_of(seed) for seed in range(3)]
     matcher = Matcher("S4", max_disparity=8, threads=3)

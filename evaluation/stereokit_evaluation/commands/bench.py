@@ -38,6 +38,7 @@ from stereokit_evaluation.bench.table import BenchResult, as_json, machine, prin
 from stereokit_evaluation.bench.timing import round_robin
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.common.sizes import Size, parse_sizes, parse_threads
+from stereokit_evaluation.common.weights import is_of_half_size
 from stereokit_evaluation.data.published import PAPER
 from stereokit_evaluation.gpu_model import table as gpu_report
 from stereokit_evaluation.study.configurations import available_variants
@@ -209,7 +210,8 @@ def _pipeline(
     """Time table II of the paper, print it and write it."""
     rows: list[PipelineRow] = []
     interrupted = False
-    calls_per_size = len(methods) * (len(available_variants()) + 5 * (runtimes is not None)) + 2 * with_baselines
+    of_runtimes = 0 if runtimes is None else 6 + 4 * (not is_of_half_size(runtimes))
+    calls_per_size = len(methods) * (len(available_variants()) + of_runtimes) + 2 * with_baselines
     machine_info = machine(system_load())
     with progress(len(sizes) * len(counts) * calls_per_size * (1 + rounds)) as (console, step):
         try:

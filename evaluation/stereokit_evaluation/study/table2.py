@@ -103,7 +103,7 @@ def time_pipeline(
     runtimes : str or None
         A refiner that is timed in each runtime and precision too; the general one at other sizes as well.
     weights : str or None
-        Of the refiners that come without.
+        Of the refiners of half-size maps.
     step : callable
         Called with a few words after each call.
     """
@@ -150,7 +150,11 @@ def _configurations(
 def _of_other_sizes(
     configurations: Sequence[Configuration], options: Mapping[str, Any]
 ) -> list[tuple[str, Configuration]]:
-    """Return what the general refiner does at other sizes than half, with what the names of these end in."""
+    """Return what the general refiner does at other sizes than half, with what the names of these end in.
+
+    As at half size it has its own weights: an option for some is that of the refiners of half-size maps.
+    """
+    options = {name: value for name, value in options.items() if name != "weights"}
     more: dict[str, dict[str, Any]] = {
         ", full size": {"scale": 1},
         ", full size, refinements=1": {"scale": 1, "refinements": 1},

@@ -1,9 +1,9 @@
 """The values that `stereokit_refiners.networks.evidence.Evidence` weighs, and their evidence: compiled loops over rows.
 
 All maps are held relative to a whole number of pixels below all of them, in steps of 1/256 of a coarse pixel. Then
-upscaling and differences are exact, and a constant that is added to all disparities changes no bit of the input.
-Rows do not depend on one another, so that the result does not depend on how they are shared out between threads; all
-operations are on integers or single IEEE ones in a fixed order.
+upscaling and differences are exact (for ranges up to some thousand pixels), and a constant that is added to all
+disparities changes no bit of the input. Rows do not depend on one another, so that the result does not depend on how
+they are shared out between threads; all operations are on integers or single IEEE ones in a fixed order.
 
 Evidence stands on a grid of half the size: each 2x2 pixels are judged by two of them, the first and the last. Loops
 that fetch from places that the data names are kept apart from those that compute, which become vector code everywhere.
@@ -25,10 +25,13 @@ from stereokit.kernels.workspace import Workspace
 from stereokit_refiners.networks.evidence import VALUES
 from stereokit_refiners.runtimes.evidence_rows import (
     REACH,
+    add_costs,
     census_phase,
     census_row,
+    eighths,
     extreme_row,
     fixed_row,
+    into_columns,
     smooth_row,
     spread_row,
     upscaled_row,
@@ -40,7 +43,6 @@ MULTIPLE = 32
 """Rows and columns of full size are extended to a multiple of this."""
 
 _STEPS = np.float32(256)  # of a coarse pixel
-_BLIND = 8  # bits that differ outside the right image: half of those of a census
 _MOST = 127  # of a gain
 _MAP_ROWS, _IMAGE_ROWS = 16, 8  # that are kept: powers of two, of which ten and five are needed at a time
 
@@ -296,47 +298,6 @@ def _transform(y: Any, s: Any, lines: Any) -> None:
 
 
 @inline
-def _add_costs(
-    mine: Any, pairs: Any, at: Any, by: Any, part: Any, columns: Any, differing: Any, total: Any
-) -> None:  # fmt: skip
-    """Add the costs of values whose whole part leads to column ``at + by``, eighths of a bit."""
-    shift = np.int32(by)
-    most = np.int32(columns)
-    for x in range(total.size):
-        place = min(max(np.int32(at[x] + shift), np.int32(0)), most)
-        differing[x] = pairs[np.uint32(place)] ^ mine[x]
-    for x in range(total.size):
-        place = np.int32(at[x] + shift)
-        v = differing[x]  # two times 16 bits, whose ones are counted side by side
-        v = np.uint32(v - ((v >> np.uint32(1)) & np.uint32(0x55555555)))
-        v = np.uint32((v & np.uint32(0x33333333)) + ((v >> np.uint32(2)) & np.uint32(0x33333333)))
-        v = np.uint32((v + (v >> np.uint32(4))) & np.uint32(0x0F0F0F0F))
-        v = np.uint32(v + (v >> np.uint32(8)))
-        first = np.int32(v >> np.uint32(16)) & np.int32(31)
-        second = np.int32(v & np.uint32(31))
-        if place < np.int32(0) or place >= most:
-            first = np.int32(_BLIND)
-        if place < np.int32(1) or place > most:
-            second = np.int32(_BLIND)
-        total[x] += np.int32(8) * first + part[x] * np.int32(second - first)
-
-
-@inline
-def _place(stride: Any, shift: Any, part: Any, at: Any) -> None:
-    """Split eighths of pixels in `part`: column ``stride * x + shift`` less the whole pixels, and what is left."""
-    for x in range(at.size):
-        at[x] = np.int32(np.int32(stride * x) + shift) - (part[x] >> np.int32(3))
-    for x in range(at.size):
-        part[x] &= np.int32(7)
-
-
-@inline
-def _eighths(row: Any, first: Any, stride: Any, part: Any) -> None:
-    for x in range(part.size):
-        part[x] = np.int32(np.floor(row[stride * x + first] * np.float32(8) + np.float32(0.5)))
-
-
-@inline
 def _compare(found: Any, h: Any, base: Any, apart: Any, columns: Any, lines: Any) -> None:
     """Compare the two images where each value of row h says, and write its cost and gains."""
     at, part, differing, totals = lines.at, lines.part, lines.differing, lines.totals
@@ -345,17 +306,17 @@ def _compare(found: Any, h: Any, base: Any, apart: Any, columns: Any, lines: Any
         for x in range(width):
             totals[k, x] = np.int32(0)
     for s in range(2):
-        _eighths(found.coarse[2 * h + s], s, 2, part)
-        _place(2, np.int32(s - base), part, at)
+        eighths(found.coarse[2 * h + s], s, 2, part)
+        into_columns(2, np.int32(s - base), part, at)
         mine, pairs = lines.mine[s], lines.pairs[s]
-        _add_costs(mine, pairs, at, 0, part, columns, differing, totals[0])
-        _add_costs(mine, pairs, at, apart, part, columns, differing, totals[1])
-        _add_costs(mine, pairs, at, -apart, part, columns, differing, totals[2])
+        add_costs(mine, pairs, at, 0, part, columns, differing, totals[0])
+        add_costs(mine, pairs, at, apart, part, columns, differing, totals[1])
+        add_costs(mine, pairs, at, -apart, part, columns, differing, totals[2])
     for k in range(4):
-        _eighths(found.others[k, h], 0, 1, part)
-        _place(2, np.int32(-base), part, at)
-        _add_costs(lines.mine[0], lines.pairs[0], at, 0, part, columns, differing, totals[3 + k])
-        _add_costs(lines.mine[1], lines.pairs[1], at, 1, part, columns, differing, totals[3 + k])
+        eighths(found.others[k, h], 0, 1, part)
+        into_columns(2, np.int32(-base), part, at)
+        add_costs(lines.mine[0], lines.pairs[0], at, 0, part, columns, differing, totals[3 + k])
+        add_costs(lines.mine[1], lines.pairs[1], at, 1, part, columns, differing, totals[3 + k])
     cost = found.cost[h]
     for x in range(width):
         cost[x] = np.uint8(totals[0, x] >> np.int32(1))

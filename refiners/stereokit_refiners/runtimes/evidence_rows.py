@@ -13,10 +13,13 @@ from stereokit.kernels.jit import inline
 
 __all__ = [
     "REACH",
+    "add_costs",
     "census_phase",
     "census_row",
+    "eighths",
     "extreme_row",
     "fixed_row",
+    "into_columns",
     "smooth_row",
     "spread_row",
     "upscaled_row",
@@ -24,6 +27,8 @@ __all__ = [
 
 REACH = 3
 """Coarse pixels to either side of the window of the smallest and largest value."""
+
+_BLIND = 8  # bits that differ outside the right image: half of those of a census
 
 
 @inline
@@ -167,3 +172,45 @@ def census_phase(a: Any, b: Any, c: Any, d: Any, e: Any, out: Any) -> None:
         bits |= _bit(c[1][x + 1], m, 8) | _bit(d[0][x], m, 9) | _bit(d[1][x], m, 10) | _bit(d[0][x + 1], m, 11)
         bits |= _bit(d[1][x + 1], m, 12) | _bit(d[0][x + 2], m, 13) | _bit(e[1][x], m, 14) | _bit(e[1][x + 1], m, 15)
         out[x] = np.uint16(bits)
+
+
+@inline
+def add_costs(
+    mine: Any, pairs: Any, at: Any, by: Any, part: Any, columns: Any, differing: Any, total: Any
+) -> None:  # fmt: skip
+    """Add the costs of values whose whole part leads to column ``at + by``, eighths of a bit."""
+    shift = np.int32(by)
+    most = np.int32(columns)
+    for x in range(total.size):
+        place = min(max(np.int32(at[x] + shift), np.int32(0)), most)
+        differing[x] = pairs[np.uint32(place)] ^ mine[x]
+    for x in range(total.size):
+        place = np.int32(at[x] + shift)
+        v = differing[x]  # two times 16 bits, whose ones are counted side by side
+        v = np.uint32(v - ((v >> np.uint32(1)) & np.uint32(0x55555555)))
+        v = np.uint32((v & np.uint32(0x33333333)) + ((v >> np.uint32(2)) & np.uint32(0x33333333)))
+        v = np.uint32((v + (v >> np.uint32(4))) & np.uint32(0x0F0F0F0F))
+        v = np.uint32(v + (v >> np.uint32(8)))
+        first = np.int32(v >> np.uint32(16)) & np.int32(31)
+        second = np.int32(v & np.uint32(31))
+        if place < np.int32(0) or place >= most:
+            first = np.int32(_BLIND)
+        if place < np.int32(1) or place > most:
+            second = np.int32(_BLIND)
+        total[x] += np.int32(8) * first + part[x] * np.int32(second - first)
+
+
+@inline
+def into_columns(stride: Any, shift: Any, part: Any, at: Any) -> None:
+    """Split eighths of pixels in `part`: column ``stride * x + shift`` less the whole pixels, and what is left."""
+    for x in range(at.size):
+        at[x] = np.int32(np.int32(stride * x) + shift) - (part[x] >> np.int32(3))
+    for x in range(at.size):
+        part[x] &= np.int32(7)
+
+
+@inline
+def eighths(row: Any, first: Any, stride: Any, part: Any) -> None:
+    """Write every `stride`-th value of a row, from `first` on, in eighths of pixels, rounded."""
+    for x in range(part.size):
+        part[x] = np.int32(np.floor(row[stride * x + first] * np.float32(8) + np.float32(0.5)))

@@ -167,7 +167,7 @@ class LearnedRefiner:
         StereokitWarning
             Once, if disparities beyond those of the training remain.
         """
-        step = round(1 / scale)
+        step = _step_of(scale)
         _check_size(coarse.disparity, left, step)
         if self.any_scale:
             return self._weighed(
@@ -313,7 +313,7 @@ class LearnedRefiner:
         """Return the refined map on the GPU, with torch in fp32; see `stereokit_refiners.contract.DeviceRefiner`."""
         maps: tuple[Any, Any, Any]
         if self.any_scale:
-            step = round(1 / scale)
+            step = _step_of(scale)
             _check_size(coarse.disparity, left, step)
             _evidence_of(coarse, left, right)
             maps = on_tensors("evidence_tensors").weigh_on_device(
@@ -348,6 +348,13 @@ class PyramidRefiner(LearnedRefiner):
 def learned_names() -> list[str]:
     """Return the names of the registered refiners that are networks."""
     return [name for name in REFINERS.names() if getattr(REFINERS.get(name), "architecture", "")]
+
+
+def _step_of(scale: float) -> int:
+    """Return how many full-size pixels a coarse pixel is wide; OptionError unless 1, 2 or 4."""
+    if scale not in (1, 0.5, 0.25):
+        raise OptionError(f"scale must be 1, 0.5 or 0.25, got {scale!r}")
+    return round(1 / scale)
 
 
 def _check_size(disparity: Any, left: Any, step: int) -> None:

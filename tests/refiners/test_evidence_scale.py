@@ -81,6 +81,9 @@ def test_what_cannot_be_is_refused_in_one_line():
     left, right = images(32, 48)
     with pytest.raises(OptionError, match=r"^evidence_scale must be 1 with scale=1, got 0.5$"):
         stereokit.Matcher("S2", scale=1, refiner="stereokit", evidence_scale=0.5, max_disparity=16)
+    for scale in (1 / 3, 0.125, 2, 0):
+        with pytest.raises(OptionError, match=r"^scale must be 1, 0.5 or 0.25, got "):
+            EvidenceRefiner()(coarse_map(8, 12), left, right=right, scale=scale)
     refiner = EvidenceRefiner(evidence_scale=0.5)
     with pytest.raises(OptionError, match="right must have the size of left"):
         refiner(coarse_map(8, 12), left, scale=0.25)

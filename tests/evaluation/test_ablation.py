@@ -26,7 +26,7 @@ from stereokit_refiners.runtimes.features import network_input  # noqa: E402
 from stereokit_refiners.runtimes.mixture import mixture  # noqa: E402
 from stereokit_refiners.runtimes.torch import runner  # noqa: E402
 from stereokit_refiners.training import evidence  # noqa: E402
-from stereokit_refiners.weights import read, shipped  # noqa: E402
+from stereokit_refiners.weights import read, shipped, write  # noqa: E402
 
 SIZE = 8, 8
 INPUTS = sum(CHANNELS.values())
@@ -48,20 +48,24 @@ UNSEEN = {
 def weights(tmp_path_factory):
     """Return weights by variant, after a few steps that would move whatever is not held."""
     folder = tmp_path_factory.mktemp("weights")
-    rng = np.random.default_rng(0)
-    fields = {
-        name: rng.integers(-40, 41, (channels, *SIZE)).astype(dtype)
-        for name, (channels, dtype) in evidence._FIELDS.items()
-    }
-    fields["kind"] = np.ones((16, *SIZE), np.uint8)
-    (folder / "samples").mkdir()
-    np.save(folder / "samples" / "a_00_S2_000.npy", evidence.packed(fields))
+    _sample(folder / "samples")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch, "compile", lambda function: function)
         for name in UNSEEN:
             path = folder / f"{name}.safetensors"
             trained(VARIANTS[name], 1, folder / "samples", path, steps=6, batch=1, size=SIZE)
     return {name: read(folder / f"{name}.safetensors") for name in UNSEEN}
+
+
+def _sample(folder):
+    rng = np.random.default_rng(0)
+    fields = {
+        name: rng.integers(-40, 41, (channels, *SIZE)).astype(dtype)
+        for name, (channels, dtype) in evidence._FIELDS.items()
+    }
+    fields["kind"] = np.ones((16, *SIZE), np.uint8)
+    folder.mkdir()
+    np.save(folder / "a_00_S2_000.npy", evidence.packed(fields))
 
 
 def head_of(content, inputs):
@@ -72,11 +76,27 @@ def head_of(content, inputs):
 def test_exported_weights_do_not_see_what_is_taken_away_and_see_all_else(weights, name):
     rng = np.random.default_rng(1)
     inputs = rng.integers(-80, 81, (INPUTS, *SIZE)).astype(np.int8)
-    expected = head_of(weights[name], inputs)
+    run = runner(Evidence(), weights[name].arrays)
+    expected = run({"evidence": inputs})
     for channel in range(INPUTS):
         other = inputs.copy()
         other[channel] = rng.integers(-80, 81, SIZE)
-        assert np.array_equal(head_of(weights[name], other), expected) == (channel in UNSEEN[name]), channel
+        assert np.array_equal(run({"evidence": other}), expected) == (channel in UNSEEN[name]), channel
+
+
+def test_weights_to_begin_with_lose_what_is_taken_away_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch, "compile", lambda function: function)
+    _sample(tmp_path / "samples")
+    write(tmp_path / "start.safetensors", shipped("evidence"))
+    content = trained(
+        VARIANTS["no grey"], 0, tmp_path / "samples", tmp_path / "weights.safetensors", steps=1, batch=1, size=SIZE,
+        start=tmp_path / "start.safetensors", rate=1e-6,
+    )  # fmt: skip
+    for key, array in shipped("evidence").arrays.items():
+        expected = array.copy()
+        if key == "stem.weight":
+            expected[:, :16] = 0
+        np.testing.assert_allclose(content.arrays[key], expected, atol=1e-4)
 
 
 def _hypotheses(seed=0):
@@ -132,7 +152,7 @@ def test_half_width_is_a_network_of_that_width(weights):
         )  # fmt: skip
 
     widths = {layer.name: (layer.outputs, layer.inputs) for layer in Narrow.layers}
-    assert {outputs for outputs, _ in widths.values()} == {8, 12, 24, 32, 32 + 0, wide.layers[-1].outputs}
+    assert {outputs for outputs, _ in widths.values()} == {8, 12, 24, 32, wide.layers[-1].outputs}
     arrays = {}
     for key, array in weights["half width"].arrays.items():
         outputs, inputs = widths[key.partition(".")[0]]
@@ -228,7 +248,7 @@ def test_the_mean_is_geometric():
     assert domains.geometric_mean(figures, reference) == pytest.approx((2 * 1 * 0.5 * 2) ** 0.25)
 
 
-SETTINGS = {"pairs": 1, "samples": 1, "steps": 1, "batch": 1, "rows": 32, "columns": 32}
+SETTINGS = {"pairs": 1, "samples": 1, "steps": 1, "batch": 1, "rows": 32, "columns": 32, "rate": 0.001, "start": None}
 
 
 @pytest.fixture

@@ -208,6 +208,8 @@ def trained(
     steps: int,
     batch: int,
     size: tuple[int, int] = (64, 96),
+    rate: float = 2e-3,
+    start: Path | None = None,
 ) -> WeightFile:
     """Train a variant on a folder of samples, from where a killed training was; return its weights.
 
@@ -216,6 +218,6 @@ def trained(
     notes = {"unseen": variant.unseen(), "values": list(variant.values), "kinds": list(variant.kinds)}
     with redirect_stdout(sys.stderr):  # what it reports on the way is no result
         return evidence.fit(
-            [evidence.Source(samples)], output, steps=steps, batch=batch, seed=seed, size=size, notes=notes,
-            prepare=lambda module: prepare(module, variant),
+            [evidence.Source(samples)], output, steps=steps, rate=rate, batch=batch, seed=seed, start=start, size=size,
+            notes=notes, prepare=lambda module: prepare(module, variant),
         )  # fmt: skip

@@ -7,6 +7,7 @@ weights.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,4 +185,4 @@ def scores(
 def geometric_mean(figures: Figures, reference: Figures) -> float:
     """Return the geometric mean of figures against others."""
     quotients = [value / reference[name][figure] for name, row in figures.items() for figure, value in row.items()]
-    return float(np.exp(np.mean(np.log(quotients))))
+    return math.prod(quotients) ** (1 / len(quotients))

@@ -8,7 +8,7 @@ chosen, and half of the channels with weights of 0 is half the width.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,8 +38,6 @@ _BY_VALUE = {"values": VALUES[3:], "gain": VALUES[1:], "surface": (VALUES[0], *V
 """Which values the channels of the input are of, four for each."""
 _DISPARITY = 64.0  # pixels; half of the range of an input
 
-Encoder = Callable[..., NDArray[np.int8]]
-
 
 @dataclass(frozen=True)
 class Variant:
@@ -51,7 +49,7 @@ class Variant:
         Of `stereokit_refiners.networks.evidence.CHANNELS`: the network does not see them.
     values : tuple of str
         Of `stereokit_refiners.networks.evidence.VALUES`: they are not chosen, and the network does not see them.
-    evidence : bool
+    gains : bool
         Whether gains times evidence are added to the logits.
     kinds : tuple of str
         Kinds of scenes to train on.
@@ -63,10 +61,10 @@ class Variant:
 
     channels: tuple[str, ...] = ()
     values: tuple[str, ...] = ()
-    evidence: bool = True
+    gains: bool = True
     kinds: tuple[str, ...] = KINDS
     narrow: bool = False
-    encoder: Encoder = network_input
+    encoder: evidence.Encoder = network_input
 
     def unseen(self) -> list[int]:
         """Return the channels of the input that the network does not see, by number."""
@@ -101,7 +99,7 @@ def absolute_input(
 
 VARIANTS: dict[str, Variant] = {
     "all": Variant(),
-    "no cost": Variant(channels=("cost", "gain"), evidence=False),
+    "no cost": Variant(channels=("cost", "gain"), gains=False),
     "no surface": Variant(channels=("surface", "outside")),
     "no grey": Variant(channels=("grey",)),
     "no candidates": Variant(values=("candidate", "rival")),
@@ -143,7 +141,7 @@ def prepare(module: Module, variant: Variant) -> None:
             first = 4 * VALUES.index(value) - 4  # the logit of the first value is 0
             free["head-weight"][first : first + 4] = free["head-bias"][first : first + 4] = 0
             weights["head-bias"][first : first + 4] = _NEVER
-        if not variant.evidence:
+        if not variant.gains:
             gains = slice(LOGITS, LOGITS + GAINS)
             free["head-weight"][gains] = free["head-bias"][gains] = 0
             weights["head-bias"][gains] = 0

@@ -31,7 +31,7 @@ from stereokit_refiners.runtimes.mixture import mixture
 from stereokit_refiners.runtimes.torch import runner
 from stereokit_refiners.weights import WeightFile
 
-__all__ = ["SETS", "RealPair", "geometric_mean", "matched_pairs", "scores"]
+__all__ = ["FIGURES", "SETS", "RealPair", "geometric_mean", "matched_pairs", "pooled", "refined", "scores"]
 
 SETS = {
     "kitti2015": "kitti2015", "kitti2012": "kitti2012", "middlebury": "middlebury", "eth3d": "eth3d",

@@ -35,7 +35,7 @@ from stereokit_refiners.runtimes.features import network_input
 from stereokit_refiners.runtimes.torch import Module, calibrate
 from stereokit_refiners.weights import WeightFile, read, write
 
-__all__ = ["LOSSES", "Source", "fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
+__all__ = ["LOSSES", "Encoder", "Source", "fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
 
 LOSSES = ("general", "d1")
 """What an error counts: soft counts of those over about 1 and 3 pixels; or of those over 3 pixels alone, KITTI's."""
@@ -50,6 +50,7 @@ _FIELDS: dict[str, tuple[int, Any]] = {
 """What is stored of each 4x4 pixels."""
 
 Encoder = Callable[..., NDArray[np.int8]]
+"""Makes what the network sees, as `stereokit_refiners.runtimes.features.network_input` does."""
 
 _FIRST = {name: sum(list(CHANNELS.values())[:k]) for k, name in enumerate(CHANNELS)}  # channel of the input
 _OCCLUDED = 0.3  # weight of pixels that the right camera does not see

@@ -129,7 +129,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the real pairs, a folder for each set")
     parser.add_argument("--cache", type=Path, required=True, help="folder of pairs, samples and weights")
     parser.add_argument("--output", "-o", type=Path, required=True, help="JSON to write, or to go on with")
-    for name, value in (("pairs", 420), ("samples", 3), ("steps", 1600), ("batch", 2), ("rows", 256), ("columns", 384)):
+    for name, value in (("pairs", 420), ("samples", 3), ("steps", 1400), ("batch", 2), ("rows", 256), ("columns", 384)):
         parser.add_argument(f"--{name}", type=int, default=value, help=f"{value} by default")
     parser.add_argument("--rate", type=float, default=2e-3, help="learning rate, %(default)s by default")
     parser.add_argument("--start", type=Path, help="weight file to begin with; from scratch by default")

@@ -161,16 +161,16 @@ def train_general(
     }  # fmt: skip
 
 
-def _generated_samples(count: int, cache: Path, assets: Assets | None) -> Path:
+def _generated_samples(count: int, cache: Path, assets: Assets | None, each: int = _SAMPLES) -> Path:
     """Render what is missing of the pairs, and of their samples; return the folder of the samples."""
     from stereokit_refiners.training import evidence
 
-    with progress(count * (1 + _SAMPLES)) as (_, step):
+    with progress(count * (1 + each)) as (_, step):
         rendered = cache / "pairs"
         for pair in pairs(count, FIRST_SEED, folder=rendered, assets=assets):
             step(f"{pair.kind} {pair.seed}")
         exact, samples = _exactly(rendered, count, cache, assets)
-        for number in range(_SAMPLES):
+        for number in range(each):
             evidence._store(exact, samples, number + 1)
             step(f"samples {number + 1} of each pair", count)
     return samples

@@ -14,7 +14,7 @@ import argparse
 import os
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from stereokit_refiners.runtimes.features import network_input
 from stereokit_refiners.runtimes.torch import Module, calibrate
 from stereokit_refiners.weights import WeightFile, read, write
 
-__all__ = ["LOSSES", "Source", "fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
+__all__ = ["LOSSES", "Encoder", "Source", "fit", "loss", "make_sample", "mixture", "packed", "unpacked"]
 
 LOSSES = ("general", "d1")
 """What an error counts: soft counts of those over about 1 and 3 pixels; or of those over 3 pixels alone, KITTI's."""
@@ -48,6 +48,9 @@ _FIELDS: dict[str, tuple[int, Any]] = {
     "kind": (16, np.uint8),  # 0 truth unknown, 1 seen by both cameras, 2 by the left one only
 }
 """What is stored of each 4x4 pixels."""
+
+Encoder = Callable[..., NDArray[np.int8]]
+"""Makes what the network sees, as `stereokit_refiners.runtimes.features.network_input` does."""
 
 _FIRST = {name: sum(list(CHANNELS.values())[:k]) for k, name in enumerate(CHANNELS)}  # channel of the input
 _OCCLUDED = 0.3  # weight of pixels that the right camera does not see
@@ -101,7 +104,7 @@ class _Keeper:
 
 def make_sample(
     left: NDArray[np.uint8], right: NDArray[np.uint8], truth: NDArray[np.float32], seen: NDArray[np.bool_],
-    method: str, scale: float, *, max_disparity: int = 0, **options: Any,
+    method: str, scale: float, *, max_disparity: int = 0, encoder: Encoder = network_input, **options: Any,
 ) -> tuple[NDArray[np.uint8], float]:  # fmt: skip
     """Match a pair; return what the network sees and should make of it, and the coarse map's share of outliers.
 
@@ -117,6 +120,8 @@ def make_sample(
     scale : {1, 0.5, 0.25}
     max_disparity : int
         The search goes so far at least, pixels; it always holds the largest of the truth.
+    encoder : callable
+        Makes what the network sees, as `stereokit_refiners.runtimes.features.network_input` does.
     **options
         Of the matcher.
     """
@@ -138,7 +143,7 @@ def make_sample(
     kind[: left.shape[0], : left.shape[1]] = np.where(known, np.where(seen, 1, 2), 0)
 
     fields = {
-        "input": network_input(found, coarse.confidence, left, left.shape[1]),
+        "input": encoder(found, coarse.confidence, left, left.shape[1]),
         "others": np.concatenate([_folded(values - found.half, 2) for values in found.others]),
         "within": _folded(found.coarse - found.half.repeat(2, 0).repeat(2, 1), 4),
         "miss": _folded(miss, 4),
@@ -179,7 +184,7 @@ def photographed(
     return one, two
 
 
-def _store(pairs: Path, folder: Path, most: int) -> None:
+def _store(pairs: Path, folder: Path, most: int, encoder: Encoder = network_input) -> None:
     """Store up to `most` samples of each pair; those that are there are left as they are."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(most):
@@ -196,7 +201,8 @@ def _store(pairs: Path, folder: Path, most: int) -> None:
             method = str(rng.choice(["S1", "S2", "S2", "S2", "S3", "S4", "S4"]))
             scale = float(rng.choice([1, 0.5, 0.5, 0.5, 0.25] if number else [1, 0.5, 0.5]))
             options: dict[str, Any] = {} if rng.random() < 0.5 else {"smooth": float(0.5 * np.exp(rng.normal(0, 0.3)))}
-            record, outliers = make_sample(left, right, truth.astype(np.float32), seen, method, scale, **options)
+            truth = truth.astype(np.float32)
+            record, outliers = make_sample(left, right, truth, seen, method, scale, encoder=encoder, **options)
             name = folder / f"{path.stem}_{number:02d}_{method}_{1000 * outliers:03.0f}.npy"
             part = name.with_suffix(".part")
             with open(part, "wb") as stream:
@@ -355,7 +361,7 @@ def _by_steps(arrays: Mapping[str, NDArray[np.float32]], factor: float) -> dict[
 def fit(
     samples: Path | Sequence[Source], output: Path, *, steps: int = 30000, rate: float = 2e-3, batch: int = 4,
     seed: int = 0, start: Path | None = None, size: tuple[int, int] = (64, 96), objective: str = "general",
-    notes: dict[str, Any] | None = None, report: int = 200,
+    notes: dict[str, Any] | None = None, report: int = 200, prepare: Callable[[Module], None] | None = None,
 ) -> WeightFile:  # fmt: skip
     """Train on stored samples, from a checkpoint if there is one, and write the weights.
 
@@ -378,6 +384,8 @@ def fit(
         For the weight file.
     report : int
         Steps between lines on standard output.
+    prepare : callable, optional
+        Changes the network before the first step, such as by a hook that holds some of its weights.
     """
     network = Evidence()
     module = Module(network, torch.Generator().manual_seed(seed))
@@ -387,6 +395,8 @@ def fit(
     checkpoint, done = output.with_suffix(".pt"), 0
     if start is not None:
         module.load(_by_steps(read(start).arrays, STEPS))
+    if prepare is not None:
+        prepare(module)
     average = {name: value.clone() for name, value in module.state_dict().items()}
     if checkpoint.is_file():
         held = torch.load(checkpoint)

@@ -35,10 +35,9 @@ class EvidenceRefiner(LearnedRefiner):
         Size of the images that are looked at. With 0.5 it refines a map of a quarter or half of the size up to half
         size, and upscales that linearly: in less than half of the time, with errors between its own and linear ones.
     refinements : int or None
-        How often it refines, 1 to 4: from the second time on its own map. Indoors and of near things two leave
-        up to a tenth fewer errors than one, on roads as many; each takes as long as the first. None is two with ``scale=1``,
-        where accuracy counts, and else one. The half-size map that says where to search is
-        refined once.
+        How often it refines, 1 to 4: from the second time on its own map. Indoors and of near things two leave up to a
+        tenth fewer errors than one, on roads as many; each takes as long as the first. None is two with ``scale=1``,
+        where accuracy counts, and else one. The half-size map that says where to search is refined once.
 
     Raises
     ------
@@ -55,7 +54,8 @@ class EvidenceRefiner(LearnedRefiner):
         if isinstance(self.evidence_scale, bool) or self.evidence_scale not in (1, 0.5):
             raise OptionError(f"evidence_scale must be 1 or 0.5, got {self.evidence_scale!r}")
         if self.refinements is not None:
-            object.__setattr__(self, "refinements", check_integer("refinements", self.refinements, 1, _MOST_REFINEMENTS))
+            count = check_integer("refinements", self.refinements, 1, _MOST_REFINEMENTS)
+            object.__setattr__(self, "refinements", count)
         super().__post_init__()
 
     def __getstate__(self) -> dict[str, Any]:

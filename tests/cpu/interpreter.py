@@ -75,7 +75,9 @@ def _wait_until(words: Any, index: int, value: int) -> None:
 def _stand_ins() -> dict[str, ModuleType]:
     jit, spin = ModuleType("stereokit.kernels.jit"), ModuleType("stereokit.kernels.spin")
     vars(jit).update(CHECKED=True, FINGERPRINT="", kernel=_same, inline=_same, by_types=_by_types)
-    vars(spin).update(WORDS_APART=1, claim=_claim, publish=_publish, spin_while=_spin_while, wait_until=_wait_until)
+    vars(spin).update(
+        WORDS_APART=1, LOOKS_AWAKE=1, claim=_claim, publish=_publish, spin_while=_spin_while, wait_until=_wait_until
+    )
     return {jit.__name__: jit, spin.__name__: spin, "stereokit.kernels.simd": lanes}
 
 

@@ -161,10 +161,11 @@ def train_general(
     }  # fmt: skip
 
 
-def _generated_samples(count: int, cache: Path, assets: Assets | None, each: int = _SAMPLES) -> Path:
+def _generated_samples(count: int, cache: Path, assets: Assets | None, each: int | None = None) -> Path:
     """Render what is missing of the pairs, and of their samples; return the folder of the samples."""
     from stereokit_refiners.training import evidence
 
+    each = _SAMPLES if each is None else each
     with progress(count * (1 + each)) as (_, step):
         rendered = cache / "pairs"
         for pair in pairs(count, FIRST_SEED, folder=rendered, assets=assets):

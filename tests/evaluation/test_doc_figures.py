@@ -163,10 +163,9 @@ def test_the_general_refiner_in_the_readme_is_that_of_its_card():
     card = ROOT / "refiners" / "stereokit_refiners" / "weights" / "MODEL_CARD.md"
     rows = re.findall(r"^\| (?:\w+, \d+) \|(.*)\|$", card.read_text(encoding="utf-8"), flags=re.M)
     cells = [[[float(x) for x in cell.split("/")] for cell in row.split("|")] for row in rows[:6]]  # its own table
-    text = re.search(
-        r"has ([\d.]+) of full size's errors in the mean\s+and ([\d.]+) in the worst case, full size with it ([\d.]+) and "
-        r"([\d.]+)", README.read_text("utf-8"),
-    )  # fmt: skip
+    number = r"(\d\.\d+)"
+    half = rf"has {number} of full size's errors in the mean\s+and {number} in the worst case"
+    text = re.search(rf"{half}, full size with it {number} and {number}", README.read_text("utf-8"))
     printed = [float(x) for x in text.groups()]
     for column, (mean, worst) in zip((2, 3), (printed[:2], printed[2:]), strict=True):
         ratios = [refined / plain for row in cells for plain, refined in zip(row[0], row[column], strict=True)]

@@ -92,7 +92,7 @@ class EvidenceRefiner(LearnedRefiner):
             raise OptionError(f"evidence_scale must be 1 with scale={scale:g}, got {self.evidence_scale:g}")
 
     def _passes_at(self, step: int) -> int:
-        """Return how often a map is refined, whose pixels are so many of the images' that are looked at."""
+        """Return how often a map is refined; `step` are the pixels of the image to one of the map."""
         return super()._passes_at(step) if self.refinements is None else self.refinements
 
     def on_device(

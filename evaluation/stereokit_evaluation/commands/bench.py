@@ -38,11 +38,9 @@ from stereokit_evaluation.bench.table import BenchResult, as_json, machine, prin
 from stereokit_evaluation.bench.timing import round_robin
 from stereokit_evaluation.common.progress import progress
 from stereokit_evaluation.common.sizes import Size, parse_sizes, parse_threads
-from stereokit_evaluation.common.weights import is_of_half_size
 from stereokit_evaluation.data.published import PAPER
 from stereokit_evaluation.gpu_model import table as gpu_report
-from stereokit_evaluation.study.configurations import available_variants
-from stereokit_evaluation.study.table2 import PipelineRow, print_pipeline, time_pipeline
+from stereokit_evaluation.study.table2 import PipelineRow, print_pipeline, rows_of_a_method, time_pipeline
 from stereokit_evaluation.study.table2 import as_json as pipeline_json
 from stereokit_evaluation.synthetic.scenes import generate
 from stereokit_refiners.learned import learned_names
@@ -210,8 +208,7 @@ def _pipeline(
     """Time table II of the paper, print it and write it."""
     rows: list[PipelineRow] = []
     interrupted = False
-    of_runtimes = 0 if runtimes is None else 6 + 4 * (not is_of_half_size(runtimes))
-    calls_per_size = len(methods) * (len(available_variants()) + of_runtimes) + 2 * with_baselines
+    calls_per_size = len(methods) * rows_of_a_method(runtimes) + 2 * with_baselines
     machine_info = machine(system_load())
     with progress(len(sizes) * len(counts) * calls_per_size * (1 + rounds)) as (console, step):
         try:

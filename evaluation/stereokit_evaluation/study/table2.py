@@ -27,8 +27,15 @@ from stereokit_evaluation.scoring.runner import Matching
 from stereokit_evaluation.study.configurations import Configuration, available_variants, build, describe_error
 from stereokit_refiners.runtimes.choice import BACKENDS, PRECISIONS
 
-__all__ = ["PipelineRow", "as_json", "print_pipeline", "time_pipeline"]
+__all__ = ["PipelineRow", "as_json", "print_pipeline", "rows_of_a_method", "time_pipeline"]
 
+_RUNTIMES = [(name, one) for name in BACKENDS for one in (PRECISIONS if name == "openvino" else ("fp32",))]
+_OTHER_SIZES: dict[str, dict[str, Any]] = {
+    ", full size": {"scale": 1},
+    ", full size, refinements=1": {"scale": 1, "refinements": 1},
+    ", a quarter of the size": {"scale": 0.25},
+    ", a quarter, evidence_scale=0.5": {"scale": 0.25, "evidence_scale": 0.5},
+}
 _PRINTED = {"original": "ZNCC+SGM", "cnn": "Non-VAE NN", "stereovae": "StereoVAE"}
 
 
@@ -131,17 +138,22 @@ def time_pipeline(
         round_robin(calls, rounds, times, step=lambda name: step(f"{size.name}, {threads} threads: {name}"))
 
 
+def rows_of_a_method(runtimes: str | None) -> int:
+    """Return how many rows the table has for each method, OpenCV's left out."""
+    if runtimes is None:
+        return len(available_variants())
+    others = 0 if is_of_half_size(runtimes) else len(_OTHER_SIZES)
+    return len(available_variants()) + len(_RUNTIMES) + others
+
+
 def _configurations(
     methods: Sequence[str], options: Mapping[str, Any], runtimes: str | None
 ) -> list[tuple[str, Configuration]]:
     """Return the configurations to time, each with the suffix of its name."""
     configurations = [("", configuration) for configuration in build(methods, available_variants(), options)]
-    for backend in BACKENDS if runtimes is not None else ():
-        for precision in PRECISIONS if backend == "openvino" else ("fp32",):
-            runtime_options = {**options, "backend": backend, "precision": precision}
-            configurations += [
-                (f", {backend} {precision}", c) for c in build(methods, [str(runtimes)], runtime_options)
-            ]
+    for backend, precision in _RUNTIMES if runtimes is not None else ():
+        runtime_options = {**options, "backend": backend, "precision": precision}
+        configurations += [(f", {backend} {precision}", c) for c in build(methods, [str(runtimes)], runtime_options)]
     if runtimes is not None and not is_of_half_size(runtimes):
         configurations += _of_other_sizes(build(methods, [runtimes], options), options)
     return configurations
@@ -155,15 +167,9 @@ def _of_other_sizes(
     As at half size it has its own weights: an option for some is that of the refiners of half-size maps.
     """
     options = {name: value for name, value in options.items() if name != "weights"}
-    more: dict[str, dict[str, Any]] = {
-        ", full size": {"scale": 1},
-        ", full size, refinements=1": {"scale": 1, "refinements": 1},
-        ", a quarter of the size": {"scale": 0.25},
-        ", a quarter, evidence_scale=0.5": {"scale": 0.25, "evidence_scale": 0.5},
-    }
     return [
         (ending, replace(c, matcher=Matcher(c.method, refiner=c.variant, **options, **its_options)))
-        for ending, its_options in more.items()
+        for ending, its_options in _OTHER_SIZES.items()
         for c in configurations
         if c.missing is None
     ]

@@ -14,7 +14,7 @@ import importlib.util
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -33,6 +33,9 @@ BACKENDS = ("openvino", "onnxruntime", "torch", "opencv")
 """The fastest first; the last comes with the base package."""
 PRECISIONS = ("fp32", "bf16", "int8")
 _MOST_KEPT = 4  # sizes
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 def _installed() -> list[str]:
@@ -141,6 +144,15 @@ def _compile(content: WeightFile, backend: str, precision: str, rows: int, colum
     return runner(network, content.arrays)
 
 
+def _kept(those: OrderedDict[K, V], key: K, make: Callable[[], V]) -> V:
+    """Return what is kept under a key, made if it is not there; the one that was asked for longest ago goes."""
+    one = those.pop(key) if key in those else make()
+    those[key] = one
+    while len(those) > _MOST_KEPT:
+        those.popitem(last=False)
+    return one
+
+
 class CompiledNetwork:
     """The compiled networks of one refiner, by size and threads; `backend` and `precision` are what runs them."""
 
@@ -165,19 +177,10 @@ class CompiledNetwork:
         key = (rows, columns, threads)
         self.settle()
         with self._lock:
-            runner = self._runs.pop(key, None) or _compile(
-                self.content, self.backend, self.precision, rows, columns, threads
-            )
-            self._runs[key] = runner
-            while len(self._runs) > _MOST_KEPT:
-                self._runs.popitem(last=False)
+            runner = _kept(self._runs, key, lambda: _compile(self.content, self.backend, self.precision, *key))
         return runner(inputs, use)
 
     def workspaces(self, *size: int) -> Pool[Workspace]:
         """Return the buffers for maps of a size."""
         with self._lock:
-            pool = self._pools.pop(size, None) or Pool(Workspace)
-            self._pools[size] = pool
-            while len(self._pools) > _MOST_KEPT:
-                self._pools.popitem(last=False)
-        return pool
+            return _kept(self._pools, size, lambda: Pool(Workspace))

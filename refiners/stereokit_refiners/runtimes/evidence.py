@@ -37,13 +37,14 @@ from stereokit_refiners.runtimes.evidence_rows import (
     upscaled_row,
 )
 
-__all__ = ["MULTIPLE", "Hypotheses", "hypotheses"]
+__all__ = ["MOST_GAIN", "MULTIPLE", "Hypotheses", "hypotheses"]
 
 MULTIPLE = 32
 """Rows and columns of full size are extended to a multiple of this."""
+MOST_GAIN = 127
+"""Eighths of a bit."""
 
 _STEPS = np.float32(256)  # of a coarse pixel
-_MOST = 127  # of a gain
 _MAP_ROWS, _IMAGE_ROWS = 16, 8  # that are kept: powers of two, of which ten and five are needed at a time
 
 
@@ -324,7 +325,7 @@ def _compare(found: Any, h: Any, base: Any, apart: Any, columns: Any, lines: Any
         gain = found.gains[k, h]
         for x in range(width):
             less = (totals[0, x] - totals[k + 1, x]) >> np.int32(1)
-            gain[x] = np.int8(min(max(less, np.int32(-_MOST)), np.int32(_MOST)))
+            gain[x] = np.int8(min(max(less, np.int32(-MOST_GAIN)), np.int32(MOST_GAIN)))
 
 
 @inline

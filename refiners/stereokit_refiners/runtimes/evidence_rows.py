@@ -12,6 +12,7 @@ import numpy as np
 from stereokit.kernels.jit import inline
 
 __all__ = [
+    "BLIND",
     "REACH",
     "add_costs",
     "census_phase",
@@ -28,7 +29,8 @@ __all__ = [
 REACH = 3
 """Coarse pixels to either side of the window of the smallest and largest value."""
 
-_BLIND = 8  # bits that differ outside the right image: half of those of a census
+BLIND = 8
+"""Bits that differ outside the right image: half of those of a census."""
 
 
 @inline
@@ -194,9 +196,9 @@ def add_costs(
         first = np.int32(v >> np.uint32(16)) & np.int32(31)
         second = np.int32(v & np.uint32(31))
         if place < np.int32(0) or place >= most:
-            first = np.int32(_BLIND)
+            first = np.int32(BLIND)
         if place < np.int32(1) or place > most:
-            second = np.int32(_BLIND)
+            second = np.int32(BLIND)
         total[x] += np.int32(8) * first + part[x] * np.int32(second - first)
 
 

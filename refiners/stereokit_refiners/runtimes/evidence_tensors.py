@@ -20,7 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from stereokit_refiners.networks.evidence import GAINS, LOGITS, STEPS, VALUES, WINDOWS
-from stereokit_refiners.runtimes.evidence import MULTIPLE
+from stereokit_refiners.runtimes.evidence import MOST_GAIN, MULTIPLE
+from stereokit_refiners.runtimes.evidence_rows import BLIND, REACH
 from stereokit_refiners.runtimes.tensors import enlarged, loaded_module, running_on
 from stereokit_refiners.runtimes.torch import Module
 from stereokit_refiners.weights import WeightFile
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TensorHypotheses", "hypotheses", "mixture", "network_input", "weigh_on_device"]
 
-_REACH = 3  # coarse pixels around one, of the smallest and largest value
-_BLIND = 8  # bits that differ outside the right image
-_MOST = 127  # of a gain
 _NONE = -1e9  # where the right view has no surface
 # The eight neighbours, and the eight that a knight of chess reaches; their order is nothing to a Hamming distance.
 _NEIGHBOURS = tuple((i, j) for i in range(5) for j in range(5) if i % 2 or j % 2)
@@ -141,7 +139,7 @@ def hypotheses(disparity: Tensor, candidates: Tensor, left: Tensor, right: Tenso
     half = _sum_by_two(coarse) * 0.25
     bits = _census(torch.stack([left, right]), height, width)
     totals = _costs(bits, coarse, others, base, columns, _apart(step))
-    gains = ((totals[0] - totals[1:]) >> 1).clamp(-_MOST, _MOST)
+    gains = ((totals[0] - totals[1:]) >> 1).clamp(-MOST_GAIN, MOST_GAIN)
     return TensorHypotheses(base, step, coarse, half, others, totals[0] >> 1, gains)
 
 
@@ -171,7 +169,7 @@ def _on_grid(maps: Tensor, step: int, height: int, width: int) -> Tensor:
 def _extremes(near: Tensor, step: int) -> Tensor:
     """Return the smallest and the largest value around each 2x2 pixels, (2, H/2, W/2), of a map (1, 1, h, w)."""
     both = torch.cat([-near, near])
-    large = F.max_pool2d(both, 2 * _REACH + 1, stride=2 if step == 1 else 1, padding=_REACH)[:, 0]
+    large = F.max_pool2d(both, 2 * REACH + 1, stride=2 if step == 1 else 1, padding=REACH)[:, 0]
     large = torch.stack([-large[0], large[1]])
     return large.repeat_interleave(2, 1).repeat_interleave(2, 2) if step == 4 else large
 
@@ -217,7 +215,7 @@ def _costs(bits: Tensor, coarse: Tensor, others: Tensor, base: Tensor, columns: 
     part = eighths & 7
     places = torch.stack([place, place - 1])
     seen = theirs.expand(2, len(VALUES), -1, -1, -1).gather(-1, places.clamp(0, 2 * width - 1).long())
-    differing = _ones(seen ^ mine).masked_fill((places < 0) | (places >= columns), _BLIND)
+    differing = _ones(seen ^ mine).masked_fill((places < 0) | (places >= columns), BLIND)
     total = 8 * differing[0] + part * (differing[1] - differing[0])
     return total[:, 0] + total[:, 1]
 

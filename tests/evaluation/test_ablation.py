@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
@@ -15,6 +17,7 @@ pytest.importorskip("safetensors")
 import stereokit  # noqa: E402
 from stereokit.errors import FileError, OptionError  # noqa: E402
 from stereokit_evaluation.commands import ablation as command  # noqa: E402
+from stereokit_evaluation.common.scripts import exit_status  # noqa: E402
 from stereokit_evaluation.data.frame import Frame  # noqa: E402
 from stereokit_evaluation.training import ablation, domains  # noqa: E402
 from stereokit_evaluation.training.ablation import VARIANTS, Variant, absolute_input, trained  # noqa: E402
@@ -311,3 +314,16 @@ def test_bad_options_are_named(tmp_path, words, message):
 def test_the_table_has_mean_and_range():
     runs = [{"variant": "all", "seed": seed, "mean": mean} for seed, mean in enumerate((0.9, 0.8, 0.85))]
     assert command.table({"runs": runs})[1].split() == ["all", "3", "0.8500", "0.8000", "0.9000"]
+
+
+def test_a_mistake_is_one_line_and_status_2(tmp_path, capsys):
+    def mistaken():
+        raise OptionError("steps must be at least 1, got 0")
+
+    assert exit_status(lambda: None) == 0
+    assert exit_status(mistaken) == 2 and capsys.readouterr().err == "error: steps must be at least 1, got 0\n"
+    words = ("--data", str(tmp_path / "none"), "--cache", str(tmp_path / "cache"), "-o", str(tmp_path / "out.json"))
+    module = "stereokit_evaluation.commands.ablation"
+    done = subprocess.run([sys.executable, "-m", module, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stderr.startswith("error: data must be a folder, got ")
+    assert len(done.stderr.splitlines()) == 1 and not list(tmp_path.iterdir())

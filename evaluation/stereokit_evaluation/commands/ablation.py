@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from stereokit.errors import FileError, OptionError
 from stereokit.images.check import check_integer, check_number
 from stereokit.io import check_output, parsing, read_text, write_bytes
 from stereokit_evaluation.common.folders import make_folder
+from stereokit_evaluation.common.scripts import exit_status
 from stereokit_evaluation.training.ablation import VARIANTS, samples_of, trained, variants_named
 from stereokit_evaluation.training.domains import geometric_mean, matched_pairs, pooled, scores
 from stereokit_refiners.weights import WeightFile, read
@@ -160,4 +162,4 @@ def _seeds(text: str) -> list[int]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))

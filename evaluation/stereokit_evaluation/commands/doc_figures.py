@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from stereokit.matching import METHODS
 from stereokit_evaluation.bench.baselines import BASELINES, HH, THREE_WAY, padded
 from stereokit_evaluation.commands.regions import scene_masks
 from stereokit_evaluation.common.progress import progress
+from stereokit_evaluation.common.scripts import exit_status
 from stereokit_evaluation.data.datasets import load_frames, select_frames
 from stereokit_evaluation.data.frame import Frame
 from stereokit_evaluation.scoring.runner import Matching, Result, run
@@ -176,4 +178,4 @@ def _percent(result: Result, measure_name: str) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_status(main))
